@@ -33,6 +33,7 @@ from firmware_py.scheduler.task import TickInfo
 from firmware_py.sensing.attitude_params import tip_lever
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.noise_file import noise_table
+from firmware_py.sensing.stage import LEAN_CORNER_HZ
 from firmware_py.tremor.config import LeverConfig
 from hal.bench import BenchFile
 from hal.errors import BenchError
@@ -108,10 +109,12 @@ def _with_lever(configs: StageConfigs) -> StageConfigs:
     tremor = configs.tremor
     if tremor.lever is not None or tremor.sees != "acceleration" or tremor.adaptive.lever_share == 0.0:
         return configs
-    arm, turning, tip = (tuple(part.tolist()) for part in tip_lever(configs.sensing))
+    arm, noise = (part.tolist() for part in tip_lever(configs.sensing))
     if not any(arm):
         return configs
-    lever = LeverConfig.model_validate({"arm_m": arm, "noise_m_s2_rtHz": turning, "tip_noise_m_s2_rtHz": tip})
+    lever = LeverConfig.model_validate(
+        {"arm_m": arm, "noise": noise, "gravity_m_s2": configs.sensing.gravity_m_s2, "lean_from_hz": LEAN_CORNER_HZ}
+    )
     return replace(configs, tremor=tremor.model_copy(update={"lever": lever}))
 
 

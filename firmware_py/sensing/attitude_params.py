@@ -71,17 +71,15 @@ def quiet_point(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.
     return r, carry @ p @ carry.T
 
 
-def tip_lever(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the arm (3,) m from the quiet point to the tip, and the noise (3,) m/s^2/sqrt(Hz) of what a turn gives the
-    tip along each axis and of the tip itself.
+def tip_lever(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the arm (3,) m from the quiet point to the tip, and the one-sided noise densities (6, 6) of the tip's
+    specific force and of alpha.
     """
-    densities = motion_densities(config)
     arm = np.asarray(config.tip_m) - quiet_point(config)[0]
     arm[np.abs(arm) < 1e-6] = 0.0
-    turn, tip = (_cross(r) for r in (arm, np.asarray(config.tip_m)))
-    turning = 2.0 * np.diag(turn @ densities[3:, 3:] @ turn.T)
-    whole = 2.0 * np.diag(np.hstack([np.eye(3), tip]) @ densities @ np.hstack([np.eye(3), tip]).T)
-    return arm, np.sqrt(turning), np.sqrt(whole)
+    carry = np.eye(6)
+    carry[:3, 3:] = _cross(np.asarray(config.tip_m))
+    return arm, 2.0 * carry @ motion_densities(config) @ carry.T
 
 
 def _cross(r: NDArray[np.float64]) -> NDArray[np.float64]:

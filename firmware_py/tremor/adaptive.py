@@ -49,6 +49,10 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("cross", "f8", (LEVELS, OUTPUTS, m)),
             ("noise_cross", "f8", (AXES, OUTPUTS, m)),
             ("noise_power", "f8", (AXES,)),
+            ("lean_by_up", "f8", (AXES, channels, 3)),
+            ("lean_by_square", "f8", (AXES, 3, 3)),
+            ("lean_cross", "f8", (2, OUTPUTS, design.bank.one)),
+            ("lean_power", "f8", (2,)),
             ("weighted_power", "f8", (LEVELS,)),
             ("least_power", "f8"),
             ("start", "f8", (AXES, LEVELS, OUTPUTS, m)),
@@ -67,6 +71,8 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("core_cross", "f8", (LEVELS, OUTPUTS, m)),
             ("core_noise_cross", "f8", (AXES, OUTPUTS, m)),
             ("core_noise_power", "f8", (AXES,)),
+            ("core_lean_cross", "f8", (2, OUTPUTS, design.bank.one)),
+            ("core_lean_power", "f8", (2,)),
             ("core_weighted_power", "f8", (LEVELS,)),
             ("core_least_power", "f8"),
         ]
@@ -99,6 +105,12 @@ def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("solved", "f8", (AXES, LEVELS, OUTPUTS, m)),  # where ``filter`` goes
             ("work", "f8", (m, m)),
             ("scale", "f8", (m,)),
+            # the sensors' noise in learning, for the present ``up`` (body)
+            ("up", "f8", (3,)),
+            ("noise_cross", "f8", (AXES, OUTPUTS, m)),
+            ("noise_power", "f8", (AXES,)),
+            ("core_noise_cross", "f8", (AXES, OUTPUTS, m)),
+            ("core_noise_power", "f8", (AXES,)),
             ("target", "f8", (OUTPUTS,)),
             ("solution", "f8", (OUTPUTS, m)),
             # the regression's sums through the tremor band's filter
@@ -137,6 +149,10 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         cross=d.cross,
         noise_cross=d.noise_cross,
         noise_power=d.noise_power,
+        lean_by_up=d.lean.by_up,
+        lean_by_square=d.lean.by_square,
+        lean_cross=d.lean_cross,
+        lean_power=d.lean_power,
         weighted_power=d.weighted_power,
         least_power=d.least_power,
         start=d.start,
@@ -154,14 +170,22 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
 
 def _shares(config: TremorConfig) -> Array:
     """(3, 3): axes tell each other the less, the less alike their noise is."""
-    noise = np.ones(AXES) if config.lever is None else np.square(config.lever.tip_noise_m_s2_rtHz)
+    noise = np.ones(AXES) if config.lever is None else np.diag(np.array(config.lever.noise))[:AXES]
     alike = np.minimum.outer(noise, noise) / np.maximum.outer(noise, noise)
     return config.adaptive.share * alike * (1.0 - np.eye(AXES)) + np.eye(AXES)
 
 
 def adaptive_state(design: AdaptiveDesign) -> Record:
     """Return the state before the first sample, which holds the prior hands' filters."""
-    return new_record(adaptive_state_dtype(design), filter=design.start, solved=design.start)
+    return new_record(
+        adaptive_state_dtype(design),
+        filter=design.start,
+        solved=design.start,
+        noise_cross=design.noise_cross,
+        noise_power=design.noise_power,
+        core_noise_cross=design.core.noise_cross,
+        core_noise_power=design.core.noise_power,
+    )
 
 
 @kernel
@@ -213,10 +237,10 @@ def adaptive_predict(state: Record, params: Record) -> None:
 
 
 @kernel
-def adaptive_correct(state: Record, axis: int, sample: float, turned: float, params: Record) -> None:
-    """Replace the predicted samples by the tick's own: of the tip, and what of it is the turn about the quiet point."""
+def adaptive_correct(state: Record, axis: int, sample: float, turned: Array, params: Record) -> None:
+    """Replace the predicted samples by the tick's own: of the tip, and the lever's (``LeverConfig``)."""
     for c in range(params.onward.shape[1]):
-        own = turned if c else sample
+        own = turned[c - 1] if c else sample
         bank_add(state.bank[axis], c, own - state.pending[axis, c], params)
         state.pending[axis, c] = own
 
@@ -282,9 +306,40 @@ def _learn(state: Record, params: Record) -> None:
         # the bank must have forgotten its start: a target's length more than the target itself
         if at >= 2 * n_taps:
             _regress(state, i, at, params)
+    if at >= 2 * n_taps:
+        _know_noise(state, params)
     axis = at % AXES  # one system a block: no tick has to solve more
     if at >= 2 * n_taps:
         _solve(state, axis, (at // AXES) % LEVELS, params)
+
+
+@kernel
+def _know_noise(state: Record, params: Record) -> None:
+    """Set the noise's share in learning for the present attitude: gravity carries that of the turns into the tip's."""
+    channels, one = params.onward.shape[1], params.lean_cross.shape[2]
+    for i in range(AXES):
+        square = 0.0
+        for k in range(3):
+            for n in range(3):
+                square += state.up[k] * params.lean_by_square[i, k, n] * state.up[n]
+        for c in range(channels):
+            linear = 0.0
+            for k in range(3):
+                linear += params.lean_by_up[i, c, k] * state.up[k]
+            if c > 0:
+                square = 0.0
+            else:
+                more = linear * params.lean_power[0] + square * params.lean_power[1]
+                state.noise_power[i] = params.noise_power[i] + more
+                more = linear * params.core_lean_power[0] + square * params.core_lean_power[1]
+                state.core_noise_power[i] = params.core_noise_power[i] + more
+            for o in range(OUTPUTS):
+                for j in range(one):
+                    at = c * one + j
+                    more = linear * params.lean_cross[0, o, j] + square * params.lean_cross[1, o, j]
+                    state.noise_cross[i, o, at] = params.noise_cross[i, o, at] + more
+                    more = linear * params.core_lean_cross[0, o, j] + square * params.core_lean_cross[1, o, j]
+                    state.core_noise_cross[i, o, at] = params.core_noise_cross[i, o, at] + more
 
 
 @kernel
@@ -380,7 +435,7 @@ def _take(
 def _mean_power(state: Record, axis: int, level: int, params: Record) -> float:
     """Return the mean square of the tremor, m^2, as the regression weighs it, noise taken off."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
-    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power[axis] * count
+    known = state.power[axis, level] + n0 * params.weighted_power[level] - state.noise_power[axis] * count
     return max(known / (count + n0), params.least_power)
 
 
@@ -389,7 +444,7 @@ def _mean_core_power(state: Record, axis: int, level: int, params: Record) -> fl
     """Return the same behind the tremor band's filter."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
     known = (
-        state.core_power[axis, level] + n0 * params.core_weighted_power[level] - params.core_noise_power[axis] * count
+        state.core_power[axis, level] + n0 * params.core_weighted_power[level] - state.core_noise_power[axis] * count
     )
     return max(known / (count + n0), params.core_least_power)
 
@@ -423,7 +478,7 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
         if share > 0.0:
             _take(
                 state, state.normal[other, level], state.right[other, level], params.rest[other],
-                params.noise_cross[other], state.count[other, level], state.power[other, level], share,
+                state.noise_cross[other], state.count[other, level], state.power[other, level], share,
                 1e300 if other == axis else power,
             )  # fmt: skip
     if params.relative > 0.0:
@@ -439,7 +494,7 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
             if share > 0.0:
                 _take(
                     state, state.core_normal[other, level], state.core_right[other, level], params.core_rest[other],
-                    params.core_noise_cross[other], state.count[other, level], state.core_power[other, level], share,
+                    state.core_noise_cross[other], state.count[other, level], state.core_power[other, level], share,
                     1e300 if other == axis else power,
                 )  # fmt: skip
     scale = state.scale

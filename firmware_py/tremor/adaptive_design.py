@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.designs import design
-from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
+from firmware_py.tremor.config import AdaptiveConfig, LeverConfig, TremorConfig
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -72,6 +72,8 @@ class CoreDesign:
     cross: Array
     noise_cross: Array
     noise_power: Array
+    lean_cross: Array
+    lean_power: Array
     weighted_power: Array
     least_power: float
 
@@ -82,7 +84,8 @@ class AdaptiveDesign:
 
     Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m). Of each axis: ``rest`` (3, m, m)
     does not scale with the tremor, ``quiet`` (3, m, m) is the penalty on what the filter passes above the band;
-    ``noise_cross`` (3, 3, m) and ``noise_power`` (3,) are the sensor noise's share in learning. All are of weighted
+    ``noise_cross`` (3, 3, m) and ``noise_power`` (3,) are the sensor noise's share in learning; ``lean`` says by how
+    much of ``lean_cross`` (2, 3, one) and ``lean_power`` (2,) gravity adds to it. All are of weighted
     signals except ``quiet``, ``start`` (3, 2, 3, m), the priors' filters, and ``onward`` (3, C, m), next samples from
     present features. ``gate_power`` (3,): of the gate's output, where both levels count the same.
     """
@@ -99,6 +102,9 @@ class AdaptiveDesign:
     cross: Array
     noise_cross: Array
     noise_power: Array
+    lean: Lean
+    lean_cross: Array
+    lean_power: Array
     weighted_power: Array  # (2,) of the priors' tremor, m^2
     least_power: float
     start: Array
@@ -110,7 +116,7 @@ class AdaptiveDesign:
 class _Spectra:
     """One-sided densities over ``hz``: unit tremor m^2/Hz per level, the rest as seen, noise of the sensor as seen.
 
-    All are of the tip; ``motion_in_channels`` and ``noise_in_channels`` say how much of them the lever's channel sees.
+    All are of the tip; ``motion_in_channels`` and ``noise_in_channels`` say how much of them the lever's channels see.
     """
 
     hz: Array
@@ -130,18 +136,61 @@ def motion_in_channels(config: TremorConfig) -> Array:
     """(C, C): covariance of the channels for a motion of the tip of unit variance.
 
     The prior hand's turn about the point that is known best is independent of that point's own motion and has
-    ``lever_share`` of the variance.
+    ``lever_share`` of the variance. It turns about the arm as much as across it, independently.
     """
     share = config.adaptive.lever_share
-    return np.array([[1.0, share], [share, share]]) if config.lever else np.ones((1, 1))
+    if config.lever is None:
+        return np.ones((1, 1))
+    return np.array([[1.0, share, 0.0], [share, share, 0.0], [0.0, 0.0, share]])
 
 
 def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
-    """(C, C): covariance of the channels' noise for noise of the tip of unit variance: all of the lever's is in it."""
+    """(C, C): covariance of the channels' noise for noise of the tip of unit variance."""
     if config.lever is None:
         return np.ones((1, 1))
-    turning = (config.lever.noise_m_s2_rtHz[axis] / config.lever.tip_noise_m_s2_rtHz[axis]) ** 2
-    return np.array([[1.0, turning], [turning, turning]])
+    signals = lever_signals(config.lever)[axis]
+    noise = signals @ np.array(config.lever.noise) @ signals.T
+    return np.asarray(noise / noise[0, 0])
+
+
+def lever_signals(lever: LeverConfig) -> Array:
+    """(3, C, 6): the channels of each axis, from the tip's specific force and the angular acceleration.
+
+    They are the tip's own, arm x alpha along the axis (the turn's part of it) and arm . alpha (the turn about the arm).
+    """
+    x, y, z = lever.arm_m
+    signals = np.zeros((AXES, 3, 6))
+    signals[:, 0, :3] = np.eye(AXES)
+    signals[:, 1, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    signals[:, 2, 3:] = lever.arm_m
+    return signals
+
+
+@dataclass(frozen=True)
+class Lean:
+    """Noise that gravity carries into the tip's acceleration, as it depends on up (3,) in the body.
+
+    Noise alpha turns the estimated attitude by -alpha / w^2, and so gravity by g up x alpha / w^2. ``by_up`` (3, C, 3)
+    times up gives the covariance of each channel of an axis with the tip's along it, to be divided by w^2;
+    ``by_square`` (3, 3, 3) with up twice the tip's own, by w^4.
+    """
+
+    by_up: Array
+    by_square: Array
+
+
+def lean_of(config: TremorConfig) -> Lean:
+    """Return zeros without a lever."""
+    lever = config.lever
+    if lever is None:
+        return Lean(np.zeros((AXES, 1, 3)), np.zeros((AXES, 3, 3)))
+    noise, signals = np.array(lever.noise), lever_signals(lever)
+    # e_k x alpha along axis i: (3, 3, 6) by i, k
+    carried = np.zeros((AXES, 3, 6))
+    carried[:, :, 3:] = lever.gravity_m_s2 * np.moveaxis(np.cross(np.eye(3)[:, None], np.eye(3)[None]), 2, 0)
+    by_up = np.einsum("icn,nm,ikm->ick", signals, noise, carried)
+    by_up[:, 0] *= 2.0
+    return Lean(by_up, np.einsum("ikn,nm,ilm->ikl", carried, noise, carried))
 
 
 def sensor_response(config: TremorConfig, hz: Array) -> Complex:
@@ -158,8 +207,13 @@ def sensor_noise(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
     if config.sees == "displacement":
         return np.full(len(hz), a.reading_noise_m**2 * per_sample)
     low_pass = np.abs(sensor_response(config, hz) / (2.0 * pi * hz) ** 2) ** 2
-    density = (a.sensor_noise_m_s2_rtHz if config.lever is None else config.lever.tip_noise_m_s2_rtHz[axis]) ** 2
+    density = a.sensor_noise_m_s2_rtHz**2 if config.lever is None else config.lever.noise[axis][axis]
     return np.asarray(low_pass * density + a.reading_noise_m_s2**2 * per_sample)
+
+
+def noise_densities(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
+    """(C, C, f): cross-spectral densities of the channels' noise."""
+    return np.asarray(noise_in_channels(config, axis)[:, :, None] * sensor_noise(config, hz, axis))
 
 
 def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
@@ -173,9 +227,8 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
     hz = np.arange(a.cancel_to_hz[1], 0.5 * config.tick_hz, 0.5)
     above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
     features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
-    density = a.quiet * above * sensor_noise(config, hz, axis) * np.maximum(1.0, shaking_power(config, hz))
-    of_tip = np.real((features * density) @ features.conj().T) * 0.5
-    return np.asarray(np.kron(noise_in_channels(config, axis), of_tip), dtype=np.float64)
+    density = a.quiet * above * noise_densities(config, hz, axis) * np.maximum(1.0, shaking_power(config, hz))
+    return _noise_covariance(features, density, 0.5)
 
 
 def shaking_power(config: TremorConfig, hz: Array) -> Array:
@@ -328,28 +381,32 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
 
     def of_axis(axis: int) -> dict[str, Any]:
         """Return what the sensor's noise along ``axis`` has a part in."""
-        noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
+        noise = noise_densities(config, s.hz, axis)
         quiet = _penalty_above_band(config, bank, axis)
-        rest = plain_rest + _covariance(plain, noise, noisy)
+        rest = plain_rest + _noise_covariance(plain, noise)
         sums = [part + rest + quiet for part in tremor]
-        gate = np.sum((s.rest + (noise - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
+        gate = np.sum((s.rest + (noise[0, 0] - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
         return {
             "gate_power": a.gate_ratio * gate,
-            "rest": phi_rest + _covariance(phi, noise, noisy),
+            "rest": phi_rest + _noise_covariance(phi, noise),
             "quiet": quiet,
-            "noise_cross": np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]),
-            "noise_power": np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
+            "noise_cross": np.stack([_noise_cross(phi, noise[:, 0] * weight * t) for t in target]),
+            "noise_power": np.sum(noise[0, 0] * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
             "start": np.stack([solve_scaled(m, r) for m, r in zip(sums, plain_cross, strict=True)]),
-            "onward": solve_scaled(sums[0], next_motion + np.stack([_cross(plain, noise * z, row) for row in noisy])),
+            "onward": solve_scaled(sums[0], next_motion + np.stack([_noise_cross(plain, row * z) for row in noise])),
         }
 
     first = of_axis(0)
     axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
     core_b, core_a = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
     core = _core_design(config, s, (core_b, core_a), plain, target, wanted, moving)
+    lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
     found = AdaptiveDesign(
         bank=bank,
         core=core,
+        lean=lean_of(config),
+        lean_cross=lean_cross,
+        lean_power=lean_power,
         block_ticks=block,
         taps=taps,
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
@@ -365,7 +422,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
         least_power=a.least_rms_m**2 * float(unit[0]),
         **{name: np.stack([each[name] for each in axes]) for name in first},
     )
-    for array in (*vars(found).values(), *vars(core).values()):
+    for array in (*vars(found).values(), *vars(core).values(), *vars(found.lean).values()):
         if isinstance(array, np.ndarray):
             array.flags.writeable = False
     return found
@@ -388,13 +445,14 @@ def _core_design(
     phi = plain * weight
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
     moved = _covariance(phi, s.rest - s.noise, moving)
-    noises = [(sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)) for axis in range(AXES)]
+    noises = [noise_densities(config, s.hz, axis) for axis in range(AXES)]
+    lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
     return CoreDesign(
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         tremor=np.stack(
             [_covariance(phi, np.abs(s.seen) ** 2 * t, moving) / u for t, u in zip(s.tremor, unit, strict=True)]
         ),
-        rest=np.stack([moved + _covariance(phi, noise, noisy) for noise, noisy in noises]),
+        rest=np.stack([moved + _noise_covariance(phi, noise) for noise in noises]),
         cross=np.stack(
             [
                 np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
@@ -402,17 +460,45 @@ def _core_design(
             ]
         ),
         noise_cross=np.stack(
-            [np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]) for noise, noisy in noises]
+            [np.stack([_noise_cross(phi, noise[:, 0] * weight * t) for t in target]) for noise in noises]
         ),
-        noise_power=np.array([np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for noise, _ in noises]),
+        lean_cross=lean_cross,
+        lean_power=lean_power,
+        noise_power=np.array([np.sum(n[0, 0] * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for n in noises]),
         weighted_power=np.array([a.tremor_rms_m**2, a.burst_rms_m**2]) * unit,
         least_power=a.least_rms_m**2 * float(unit[0]),
     )
 
 
+def _lean_noise(
+    config: TremorConfig, s: _Spectra, phi: Complex, weight: Complex, target: Complex
+) -> tuple[Array, Array]:
+    """Return (2, OUTPUTS, one) and (2,): what noise of unit density over w^2 and over w^4 adds to a channel's
+    ``noise_cross`` and to ``noise_power``."""
+    if config.lever is None:
+        return np.zeros((2, OUTPUTS, len(phi))), np.zeros(2)
+    w2 = (2.0 * pi * s.hz) ** 2
+    low_pass = np.abs(s.seen / w2) ** 2
+    fourth = s.hz**4
+    lean = fourth / (fourth + config.lever.lean_from_hz**4) / w2
+    densities = [low_pass * lean, low_pass * lean**2]
+    cross = [[_cross(phi, density * weight * t, np.ones(1)) for t in target] for density in densities]
+    return np.array(cross), np.array([np.sum(d * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for d in densities])
+
+
 def _covariance(features: Complex, density: Array, channels: Array) -> Array:
     of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
     return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
+
+
+def _noise_covariance(features: Complex, noise: Array, step_hz: float = GRID_STEP_HZ) -> Array:
+    """(m, m): of all channels' features, for noise of densities (C, C, f)."""
+    return np.block([[np.real((features * each) @ features.conj().T) * step_hz for each in row] for row in noise])
+
+
+def _noise_cross(features: Complex, densities: Complex | Array) -> Array:
+    """(m,): features of all channels with a signal that has the cross-densities (C, f) with them."""
+    return np.concatenate([np.real(np.conj(features) @ each) * GRID_STEP_HZ for each in densities])
 
 
 def _cross(features: Complex, density: Complex | Array, channel: Array) -> Array:

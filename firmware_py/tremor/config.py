@@ -11,10 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from firmware_py.tremor.detector_config import DetectorConfig
 from hal.plugins import ESTIMATORS, offered
+from hal.types import STANDARD_GRAVITY
 from hal.validation import NotNegative, Positive, validate_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Edge = tuple[Positive, Positive]
+_Row = tuple[float, float, float, float, float, float]
 
 Method = str
 """One of ``METHODS``, or a name that an installed package offers (``firmware_py.tremor.own``)."""
@@ -114,13 +116,14 @@ class AdaptiveConfig(_Table):
     does not yield when the manipulator runs out of stroke. Two filters are learned, for a calm hand and for a burst,
     and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
     all that is no tremor. ``share``: what an axis takes from the others. ``lever_share``: part of the
-    prior hand's motion (variance) that is a turn about the quiet point. ``quiet``: above the band, sensor noise counts
-    for so many times its power, so that the filter does not shake the tip there. ``shaken_hz``: lowest and highest
-    resonance of the actuators, with ``shaken_damping``; the penalty is as much larger as a held command shakes them
-    more. Empty: the penalty is flat. ``ease_s``: time constant with which a filter in use approaches the one that was
-    solved last. ``relative``: the error is counted twice, relative to the hand's motion in all that is cancelled and,
-    ``relative`` times, in the tremor band (a peak at ``emphasis_hz`` with ``core_q``); so a hand whose slow motion is
-    larger does not get less of its tremor cancelled. The penalty above the band is then relative to the tremor, too.
+    prior hand's motion (variance) that is a turn about the quiet point; about the arm it turns as much. ``quiet``:
+    above the band, sensor noise counts for so many times its power, so that the filter does not shake the tip there.
+    ``shaken_hz``: lowest and highest resonance of the actuators, with ``shaken_damping``; the penalty is as much larger
+    as a held command shakes them more. Empty: the penalty is flat. ``ease_s``: time constant with which a filter in use
+    approaches the one that was solved last. ``relative``: the error is counted twice, relative to the hand's motion in
+    all that is cancelled and, ``relative`` times, in the tremor band (a peak at ``emphasis_hz`` with ``core_q``); so a
+    hand whose slow motion is larger does not get less of its tremor cancelled. The penalty above the band is then
+    relative to the tremor, too.
     0: the error is counted in metres.
     """
 
@@ -189,15 +192,19 @@ class LeverConfig(_Table):
     """Holds what the instrument knows of its own turning (``firmware_py.sensing.quiet_point``).
 
     Accelerometers know the acceleration of one point best; from there to the tip the noise of the angular acceleration
-    counts with the arm. The adaptive method sees that part by itself and trusts it as far as this hand turns.
+    counts with the arm. The adaptive method sees that part by itself and trusts it as far as this hand turns. It also
+    sees the turn about the arm. That turn does not move the tip, but its noise is made by the same accelerometers: what
+    the two share is noise, and the filter takes it out.
     """
 
     arm_m: tuple[float, float, float]
     """From the quiet point to the tip, body frame."""
-    noise_m_s2_rtHz: tuple[NotNegative, NotNegative, NotNegative]
-    """Of angular acceleration times arm, along each axis."""
-    tip_noise_m_s2_rtHz: tuple[Positive, Positive, Positive]
-    """Of the tip: with the noise of the quiet point."""
+    noise: tuple[_Row, _Row, _Row, _Row, _Row, _Row]
+    """One-sided densities: of the tip's specific force (m/s^2), then of the angular acceleration (rad/s^2)."""
+    gravity_m_s2: Positive = STANDARD_GRAVITY
+    lean_from_hz: Positive = 0.3
+    """Above it the attitude is the double integral of the angular acceleration, so gravity carries that noise into the
+    tip's acceleration."""
 
 
 class TremorConfig(_Table):

@@ -23,7 +23,7 @@ from firmware_py.tremor.adaptive import (
     adaptive_state,
     adaptive_state_dtype,
 )
-from firmware_py.tremor.adaptive_design import AdaptiveDesign, design_adaptive
+from firmware_py.tremor.adaptive_design import AdaptiveDesign, design_adaptive, lever_signals
 from firmware_py.tremor.ar_kalman import (
     AR,
     ar_coast,
@@ -79,6 +79,7 @@ FAMILY = {
     "ar_kalman": AUTOREGRESSIVE,
 }
 NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST, CORE = range(6)
+TURNS = 2  # signals of an axis beside the tip's acceleration
 ROWS = 6
 """Rows of what a step gives, each for three axes."""
 
@@ -103,7 +104,7 @@ def estimator_params(config: TremorConfig) -> Record:
             ("delay_ticks", "i8"),
             ("settle_ticks", "f8"),
             ("max_gap_ticks", "f8"),
-            ("arm", "f8", (AXES,)),  # m, from the quiet point to the tip
+            ("lever", "f8", (AXES, TURNS, AXES)),  # m, from angular acceleration to an axis' further signals
             ("smoothing", "f8"),
             ("floor2", "f8"),  # m^2
         ]
@@ -123,7 +124,7 @@ def estimator_params(config: TremorConfig) -> Record:
         delay_ticks=min(HISTORY - 1, round(config.loop_delay_s * config.tick_hz)),
         settle_ticks=config.settle_s * config.tick_hz,
         max_gap_ticks=float(config.max_gap_ticks),
-        arm=config.lever.arm_m if config.lever else np.zeros(AXES),
+        lever=lever_signals(config.lever)[:, 1:, AXES:] if config.lever else np.zeros((AXES, TURNS, AXES)),
         smoothing=1.0 - exp(-1.0 / (config.smoothing_s * config.tick_hz)),
         floor2=config.floor_m**2,
     )
@@ -145,7 +146,7 @@ def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
             ("ticks", "f8"),  # since the start
             ("last_tick", "f8"),  # of the stage that reads frames
             ("samples", "f8", (AXES,)),
-            ("turned", "f8", (AXES,)),  # part of the samples that is the turn about the quiet point
+            ("turned", "f8", (AXES, TURNS)),  # the turns across the arm, a part of the samples, and about it
             ("out", "f8", (ROWS, AXES)),
         ]
     )

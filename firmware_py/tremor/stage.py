@@ -10,6 +10,7 @@ from firmware_py.frame import (
     ANGULAR_ACCELERATION,
     CONFIDENCE,
     INVALID,
+    QUATERNION,
     RESTARTED,
     SETTLING,
     STALE,
@@ -32,6 +33,7 @@ from firmware_py.tremor.estimator import (
     FREQUENCY,
     NOW,
     TRUST,
+    TURNS,
     estimator_output,
     estimator_params,
     estimator_samples,
@@ -46,7 +48,8 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
     """Fill the columns from ``tremor`` to ``confidence`` and add the bit ``SETTLING`` to ``status``.
 
     Input: ``tip_acceleration`` (3,) in m/s^2 and ``angular_acceleration`` (3,) in rad/s^2, both in the body frame.
-    Output per axis: tremor now, tremor ``TremorConfig.loop_delay_s`` later, its core (the part that does not yield when
+    The attitude (``quaternion``) says into which axes gravity carries the noise of a turn. Output per axis: tremor now,
+    tremor ``TremorConfig.loop_delay_s`` later, its core (the part that does not yield when
     the stroke runs out) and amplitude in m, frequency in Hz, confidence from 0 to 1. ``params`` come from
     ``TremorConfig`` (``estimator_params``); ``states`` is the memory of the estimator.
 
@@ -73,11 +76,14 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
     if not coast:
         for i in range(AXES):
             state.samples[i] = frame[TIP_ACCELERATION + i]
-            # angular acceleration x arm (m, quiet point to tip): the part of the reading that is a turn
-            j, k = (i + 1) % AXES, (i + 2) % AXES
-            state.turned[i] = (
-                frame[ANGULAR_ACCELERATION + j] * param.arm[k] - frame[ANGULAR_ACCELERATION + k] * param.arm[j]
-            )
+            for c in range(TURNS):
+                turned = 0.0
+                for j in range(AXES):
+                    turned += param.lever[i, c, j] * frame[ANGULAR_ACCELERATION + j]
+                state.turned[i, c] = turned
+        w, x, y, z = frame[QUATERNION], frame[QUATERNION + 1], frame[QUATERNION + 2], frame[QUATERNION + 3]
+        up = state.adaptive.up
+        up[0], up[1], up[2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
         estimator_samples(state, param)
     estimator_output(state, param)
     for i in range(AXES):
