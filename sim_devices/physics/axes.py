@@ -13,12 +13,12 @@ _VECTORS = ("specific_force_", "field_")
 
 
 def own_axis(output: str) -> str:
-    """The axis letter of an output such as ``voltage_x`` or ``accel_3y``."""
+    """Return the axis letter of an output such as ``voltage_x`` or ``accel_3y``."""
     return output[-1]
 
 
 def vector_of(signals: Mapping[str, Array]) -> dict[str, str]:
-    """Axis letter -> signal of the recorded input vector."""
+    """Return axis letter -> signal of the recorded input vector."""
     for prefix in _VECTORS:
         found = {a: prefix + a for a in "xyz" if prefix + a in signals}
         if found:
@@ -27,7 +27,7 @@ def vector_of(signals: Mapping[str, Array]) -> dict[str, str]:
 
 
 def others(signals: Mapping[str, Array], output: str) -> list[str]:
-    """Axis letters beside the output's own whose signals vary."""
+    """Return the axis letters other than the output's own whose signals vary."""
     return [a for a, s in vector_of(signals).items() if a != own_axis(output) and float(np.ptp(signals[s])) > 0.0]
 
 
@@ -40,9 +40,9 @@ def _turnable(signals: Mapping[str, Array], output: str) -> str:
 
 
 def vector_at(ctx: Context) -> dict[str, Array]:
-    """Axis letter -> the vector (n,) where the sensor sits: a body that turns accelerates elsewhere as well.
+    """Return axis letter -> specific force (n,) at the sensor, which a rotation changes with the sensor's position r.
 
-    f + alpha x r + omega x (omega x r), H. Goldstein, Classical Mechanics, 3rd ed., eq. 4.91; r as believed.
+    f + alpha x r + omega x (omega x r), H. Goldstein, Classical Mechanics, 3rd ed., eq. 4.91; r is the nominal one.
     """
     here = {a: ctx.signals[s] for a, s in vector_of(ctx.signals).items()}
     r = np.array(ctx.facts.get("position_m", ()))
@@ -72,7 +72,7 @@ _PAIRS = (("x", "y"), ("x", "z"), ("y", "z"))
 
 
 def _rotation_columns(ctx: Context) -> Array:
-    """Columns of a small rotation of the whole vector: output i gets -(phi x f)_i."""
+    """Return the columns of a small rotation of the whole vector: output i gets -(phi x f)_i."""
     vector = vector_at(ctx)
     i = "xyz".index(own_axis(ctx.output))
     out = np.zeros((ctx.t.size, 3))

@@ -85,7 +85,10 @@ _ALL = (
 
 
 class _Vocabulary(Mapping[str, Effect]):
-    """Ours, then those of installed packages (entry points of group ``micron.effects``), looked up when asked."""
+    """Maps names to effects: built-in ones, then those of installed packages (entry points of ``micron.effects``).
+
+    Packages are looked up when they are asked for.
+    """
 
     def __init__(self) -> None:
         self._ours = {e.name: e for e in _ALL}

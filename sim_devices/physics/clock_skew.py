@@ -13,7 +13,7 @@ from sim_devices.physics.resampling import delay_by_correlation, resample, resam
 
 
 def local_delays(model: Array, error: Array, keep: np.ndarray, windows: int) -> tuple[Array, Array, Array]:
-    """(centre sample, delay in samples, its standard error) per window, by regression of the error on -d model/dk."""
+    """Estimate (centre sample, delay in samples, its standard error) per window: regression of error on -d model/dk."""
     n = model.size
     slope = np.gradient(model)
     edges = np.linspace(0, n, windows + 1).astype(int)

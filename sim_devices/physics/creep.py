@@ -11,14 +11,14 @@ from sim_devices.physics.lag import low_pass
 
 
 def time_constants(dt: float, span: float) -> tuple[float, ...]:
-    """About two per decade, from five samples (or 1/3000 of the record) to twice the record."""
+    """Return time constants, about two per decade, from five samples (or span / 3000) to twice the span."""
     lo, hi = max(5 * dt, span / 3000), 2 * span
     n = int(np.clip(np.ceil(2 * np.log10(hi / lo)) + 1, 4, 10))
     return tuple(float(t) for t in np.geomspace(lo, hi, n))
 
 
 def modes(x: Array, dt: float, taus: Sequence[float], rest: float, starts: tuple[int, ...]) -> Array:
-    """Relaxation of each mode towards x from ``rest``, (n, modes): tau z' = x - z, z(start) = rest."""
+    """Return the relaxation (n, modes) of each mode towards x from ``rest``: tau z' = x - z, z(start) = rest."""
     at = np.array(starts)
     out = np.empty((len(taus), x.size))
     for j, tau in enumerate(taus):
@@ -62,7 +62,7 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
 
 
 def per_decade(p: Array, taus: Sequence[float], scale: float, decades: tuple[float, float]) -> float:
-    """Mean rise per decade of time of the response to a unit step, relative to ``scale``."""
+    """Return the mean rise per decade of time of the response to a unit step, relative to ``scale``."""
     t = np.array([10.0 ** decades[0], 10.0 ** decades[1]])
     rise = (1 - np.exp(-t[:, None] / np.array(taus))) @ p
     return float((rise[1] - rise[0]) / max(decades[1] - decades[0], 1e-9) / scale) if scale else 0.0

@@ -14,8 +14,10 @@ KNOTS = 9
 
 
 def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
-    """Columns of a curve without its straight part. ``shape`` 2..5: Legendre polynomials up to that degree, continued
-    by their tangents outside [lo, hi]; 0: hinges |x - knot| on a uniform grid and at zero (piecewise linear).
+    """Return the columns of a curve without its straight part.
+
+    ``shape`` 2..5: Legendre polynomials up to that degree, continued by their tangents outside [lo, hi]; 0: hinges
+    |x - knot| on a uniform grid and at zero (piecewise linear).
     """
     half = 0.5 * (hi - lo)
     z = (x - 0.5 * (lo + hi)) / half
@@ -37,7 +39,7 @@ def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
 
 
 def _curve_choose(x: Array, target: Array, ctx: Context) -> tuple[float, int, float, float]:
-    """(score, shape, lo, hi): the curve over x that meets the target best for its size."""
+    """Return (score, shape, lo, hi) of the curve over x with the best fit for its number of columns."""
     lo, hi = value_range(x)
     k = thin(ctx.keep, 8000)
     straight = ctx.line(x, k)

@@ -130,10 +130,12 @@ def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
 
 @kernel
 def local_level(residual, gap_s, believed, ratio, forgets_1_s):
-    """One-step prediction errors and their deviations (both (n,)) of a walk under white noise of unit rms, whose
-    variance grows by ``ratio`` a second, and which returns to zero at the rate ``forgets_1_s`` (0: never).
-    A. C. Harvey, Forecasting, Structural Time Series Models (1989), eq. 4.1.2. The first sample that is believed sets
-    the level, and its own error is zero."""
+    """Return the one-step prediction errors and their deviations, both (n,), of a walk under white noise of unit rms.
+
+    The variance of the walk grows by ``ratio`` a second, and the walk returns to zero at the rate ``forgets_1_s``
+    (0: never). A. C. Harvey, Forecasting, Structural Time Series Models (1989), eq. 4.1.2. The first valid sample sets
+    the level, and its own error is zero.
+    """
     n = residual.size
     error = np.zeros(n)
     deviation = np.ones(n)
@@ -163,7 +165,10 @@ def local_level(residual, gap_s, believed, ratio, forgets_1_s):
 
 @kernel
 def local_slope(residual, gap_s, believed, ratio):
-    """The same of an integrated walk: its slope walks, by ``ratio`` a second (Harvey 1989, eq. 2.3.27)."""
+    """Return one-step errors and deviations, as ``local_level`` does, of an integrated walk.
+
+    The slope walks; its variance grows by ``ratio`` a second (Harvey 1989, eq. 2.3.27).
+    """
     n = residual.size
     error = np.zeros(n)
     deviation = np.ones(n)
@@ -196,16 +201,18 @@ def local_slope(residual, gap_s, believed, ratio):
 
 
 RATIOS = (-6.0, 6.0)
-"""Decades that the growth of a walk's variance within one sample, over that of the white noise, is searched in."""
+"""Search range, in decades, of the growth of a walk's variance within one sample over that of the white noise."""
 OUTLIER = 6.0
-"""Robust rms beyond which an error counts as that."""
+"""Size, in robust rms, beyond which an error counts as an outlier."""
 FORGETS = (0.001, 0.01, 0.1)
-"""Times after which a stationary rival of a walk forgets, in lengths of the record."""
+"""Correlation times of the stationary rivals of a walk, in lengths of the record."""
 
 
 def likeliest(law: Law, least: float, learned: NDArray[np.bool_], decades: Sequence[float]) -> tuple[float, float]:
-    """(ratio, minus the mean log density on ``learned`` samples) of the likeliest ratio. The scale is no less
-    than ``least``."""
+    """Return (ratio, minus the mean log density on ``learned`` samples) of the most likely ratio.
+
+    The scale is at least ``least``.
+    """
 
     def badness(v: float) -> float:
         error, deviation = law(10.0**v)
@@ -226,8 +233,11 @@ def likeliest(law: Law, least: float, learned: NDArray[np.bool_], decades: Seque
 def predict_walk(
     residual: Array, gap_s: Array, believed: NDArray[np.bool_], learned: NDArray[np.bool_], least: float
 ) -> tuple[Array, Array]:
-    """``Effect.predict`` of a walk. It predicts nothing where an integrated walk, which is smooth, or one that forgets
-    is likelier by more than a parameter costs (Schwarz 1978): then what drifts is no walk."""
+    """Implement ``Effect.predict`` for a walk.
+
+    It predicts nothing where an integrated walk (which is smooth) or a stationary one is more likely by more than the
+    price of a parameter (Schwarz 1978): then the drift is no random walk.
+    """
     gaps = gap_s[1:]
     step_s = float(np.median(gaps)) if gaps.size else 1.0
     length_s = float(np.sum(gaps))

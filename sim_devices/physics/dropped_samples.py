@@ -13,7 +13,7 @@ from sim_devices.physics.statistics import robust_rms
 
 @kernel
 def shift_by(x, at, total):
-    """y[k] = x[k + s(k)] where s jumps to ``total[i]`` at sample ``at[i]``; edges are held."""
+    """Return y[k] = x[k + s(k)], where s jumps to ``total[i]`` at sample ``at[i]``; edges are held."""
     n = x.size
     y = np.empty(n)
     s = 0
@@ -28,7 +28,7 @@ def shift_by(x, at, total):
 
 @kernel
 def best_shifts(costs, price):
-    """Cheapest path of shifts over windows: ``costs`` (windows, shifts), ``price`` for each change (Viterbi)."""
+    """Return the cheapest path of shifts over windows: ``costs`` (windows, shifts), ``price`` per change (Viterbi)."""
     w, m = costs.shape
     total = costs[0].copy()
     back = np.zeros((w, m), np.int64)
@@ -56,8 +56,10 @@ def best_shifts(costs, price):
 
 @kernel
 def shift_costs(x, y, window, shifts, local):
-    """Sum of squares (windows, shifts) of y less the shifted x in each window of ``window`` samples, about the
-    window's own mean where ``local``."""
+    """Return the sum of squares (windows, shifts) of y less the shifted x in each window of ``window`` samples.
+
+    ``local`` removes the window's own mean first.
+    """
     n = x.size
     count = n // window
     out = np.empty((count, shifts.size))
@@ -103,7 +105,7 @@ def _squares_left(model: Array, measured: Array, at: Sequence[int], total: Seque
 
 
 def _path_of_shifts(model: Array, measured: Array, local: bool) -> tuple[list[int], list[int], float, float]:
-    """``find_drops`` with the mean of every window left out (``local``) or only that of the record."""
+    """Find drops as ``find_drops`` does, without the mean of every window (``local``) or only that of the record."""
     n = model.size
     y = measured - measured.mean()
     x = model - model.mean()

@@ -38,7 +38,7 @@ STAGES: tuple[Stage, ...] = (
 """The order in which a signal passes them."""
 
 Kind = Literal["add", "linear", "nonlinear", "feedback"]
-"""How an effect acts on the signal that it sits on.
+"""The way in which an effect acts on its target signal.
 
 add        x + basis(x, ...) @ weights
 linear     a linear operator on x (filter, delay, resampling): applied to every column of a design
@@ -52,11 +52,12 @@ Site = Literal["input", "output", "between"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect. Bounds are in ``unit``; ``log`` says that its size, not its value, is uncertain.
+    """Describes a parameter of an effect. Bounds are in ``unit``; ``log`` says that it is searched by its logarithm.
 
     A ``unit`` may contain ``{in}`` and ``{out}``, the units of the signals before and after the base physics.
-    ``scale`` is a typical step for finite differences and for conditioning. ``away``: where it does nothing; a fit
-    leaves it there that does not notice, so that samples which no fit has seen are not told what no sample has shown.
+    ``scale`` is a typical step for finite differences and for conditioning. ``away`` is a value at which the parameter
+    has no influence. A fit that is insensitive to the parameter leaves it there, so that predictions of samples outside
+    the fit do not depend on a value that no sample determines.
     """
 
     name: str
@@ -100,7 +101,7 @@ class Context:
     believed: Array | None = None
     through: Callable[[Array], Array] | None = None
     bends: Array | None = None
-    """(n, k) for guesses: what the output moves with each searched parameter of the simulation, per unit."""
+    """Derivatives (n, k) of the output with respect to each searched parameter of the simulation; for guesses only."""
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -132,10 +133,10 @@ class Context:
 
 @dataclass(frozen=True)
 class Signature:
-    """Outcome of the cheap test by which a residual shows that an effect may be there.
+    """Holds the outcome of the cheap test that screens a residual for an effect.
 
-    ``p_value`` under the null that the residual does not know of the effect; ``share`` the part of the
-    residual's variance that this effect could take at best, 0..1.
+    ``p_value`` holds under the null hypothesis that the effect is absent; ``share`` is the largest part of the
+    residual's variance that the effect could explain, 0..1.
     """
 
     p_value: float
@@ -145,8 +146,10 @@ class Signature:
 
 @dataclass(frozen=True)
 class Human:
-    """A parameter for the report: ``value`` in ``unit``, derived from the fitted ones; ``spread`` its standard
-    deviation whatever the noise, where it is the mean of something that wanders.
+    """Holds a parameter for the report: ``value`` in ``unit``, derived from the fitted ones.
+
+    ``spread`` is the standard deviation that remains without noise, where the value is the mean of a quantity that
+    wanders.
     """
 
     name: str
@@ -157,7 +160,7 @@ class Human:
 
 @dataclass(frozen=True)
 class Parts:
-    """The two parameter lists of an effect for given settings: searched, and solved exactly."""
+    """Lists the parameters of an effect for given settings: those that are searched and those solved exactly."""
 
     nonlinear: tuple[Parameter, ...] = ()
     weights: tuple[Parameter, ...] = ()
@@ -172,24 +175,24 @@ Guess = Callable[[Array, Array, Context, Settings], Sequence[Sequence[float]]]
 Test = Callable[[Array, Array, Context], Signature]
 Report = Callable[[Array, Settings, float], Sequence[Human]]
 Predict = Callable[[Array, Array, NDArray[np.bool_], NDArray[np.bool_], float], tuple[Array, Array]]
-"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), those to learn from (n,), least rms
-of what is white) -> errors of the prediction of each sample from those before (n,), and their standard deviations up to
-a factor (n,), which are at least one."""
+"""Signature of a predictor. Arguments: residual (n,), time since the previous sample (n,) in s, valid samples (n,),
+training samples (n,), least rms of the white part. Returns the one-step prediction errors (n,) and their standard
+deviations (n,) up to a common factor; the deviations are at least one."""
 
 
 def no_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    """An effect that reads nothing off the data."""
+    """Return the settings of an effect that reads nothing off the data."""
     return {}
 
 
 def no_start(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    """An effect without nonlinear parameters has one start: the empty one."""
+    """Return the only start of an effect without nonlinear parameters: the empty one."""
     return ((),)
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect of the vocabulary.
+    """Defines an effect of the vocabulary.
 
     ``prepare(x, residual, ctx) -> settings`` reads what must be frozen. ``parts(settings)`` lists the parameters.
     ``apply(x, ctx, q, settings) -> (n,)`` for kinds linear and nonlinear; ``basis(x, ctx, q, settings) -> (n, k)``
@@ -225,48 +228,52 @@ class Effect:
     needs: tuple[str, ...] = ()
     shared: bool = False
     acts_on: tuple[Literal["motion", "storage", "storages", "parameter"], ...] = ("motion",)
-    """Feedback only: at a velocity, at any other state (a level, a current, a temperature), at all such at once, or on
-    a parameter of differential equations."""
+    """Where a feedback effect acts: at a velocity, at any other state (a level, a current, a temperature), at all such
+    states at once, or on a parameter of differential equations."""
     position_unit: str = ""
-    """Feedback only: the unit that the position must have which it depends on; empty: any."""
+    """Unit that the position must have for a feedback effect; empty: any."""
     twins: tuple[str, ...] = ()
-    """Twin kinds that can have it; empty: all."""
+    """Twin kinds that can have the effect; empty: all."""
     available: Callable[[Mapping[str, Array], str], str] | None = None
-    """(signals, output) -> why it cannot be proposed there, "" if it can; for needs that a fixed list cannot say."""
+    """(signals, output) -> reason why the effect cannot be proposed there, "" if it can. Serves needs that a fixed list
+    cannot express."""
     claims: Callable[[Settings, int], NDArray[np.bool_]] | None = None
-    """(settings, n) -> samples that it takes as its own events: not to be fitted, nor held against the model."""
+    """(settings, n) -> mask (n,) of the samples that the effect claims as its own events. They are excluded from the
+    fit and from the score."""
     variants: tuple[Effect, ...] = ()
     """The same physics in other shapes, or at another place of the equations (hysteresis as a force); same name, other
     equation."""
     fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
-    """Its course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""
+    """True if the course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""
     predict: Predict | None = None
-    """Its law, where it is noise: what the samples so far say of the next one. It is weighed by this, and not by the
+    """One-step predictor of an effect that is noise. The effect is scored by its prediction errors and not by the
     course that was read off the data."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    """Human parameters (``report``) outside of which it is other physics in disguise; checked before it is named."""
+    """Ranges of human parameters (``report``) outside of which the effect is other physics in disguise. They are
+    checked before it is named."""
     forbidden: Mapping[str, tuple[tuple[float, float], ...]] = field(
         default_factory=dict[str, tuple[tuple[float, float], ...]]
     )
-    """The same the other way round: ranges of human parameters that are by definition another effect's."""
+    """Ranges of human parameters that belong to another effect by definition."""
     vanishes_with: tuple[tuple[str, ...], ...] = ()
     """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect is absent when every
     parameter of any one group is zero, so it is named only where the data exclude that. Empty: one group of all.
     """
     essential: tuple[str, ...] = ()
-    """Searched parameters without which the effect says nothing: it is not named when one ends at its bound."""
+    """Searched parameters that the effect needs: it is not named when one ends at its bound."""
     plain: str = ""
-    """Vocabulary name of the simpler effect that it generalises, tried in its place when it is not borne out."""
+    """Vocabulary name of the simpler effect that this one generalises. It is tried instead when this one is not
+    supported by the data."""
 
     proportional: bool = False
-    """For kind add: twice the signal makes twice of it. Behind columns of simulated output nobody can tell it from
-    parameters of the simulation that are off."""
+    """True if an effect of kind add is proportional to the signal. Behind columns of simulated output it cannot be
+    distinguished from wrong parameters of the simulation."""
 
     @property
     def is_linear(self) -> bool:
-        """Whether what it makes of a signal is linear in it."""
+        """True if the effect maps the signal linearly."""
         return self.kind == "linear" or self.proportional
 
     @property

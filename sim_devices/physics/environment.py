@@ -19,7 +19,7 @@ def _varies(name: str, signals: Mapping[str, Array]) -> str:
 
 
 def _gain_column(x: Array, change: Array, centre: float) -> Array:
-    """Change of sensitivity: about the middle of the input range, so that it is not also a change of offset."""
+    """Return the column of a sensitivity change about the middle of the input range, so that it changes no offset."""
     return (x - centre) * change
 
 

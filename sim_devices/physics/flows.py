@@ -10,13 +10,13 @@ from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter,
 from sim_devices.physics.forces import ABOVE, FLOW, ROOT
 
 PAIRS = "pairs"
-"""Fact of a place: flattened pairs (state that a flow depends on, state whose derivative it is added to), the outflow
-of each storage first, then what goes from it into others."""
+"""Name of a fact of a place: flattened pairs (state that a flow depends on, state whose derivative it is added to). The
+outflow of each storage comes first, then the flows from it into others."""
 
 
 RANGES = "ranges"
-"""Fact of a place: of each of its storages, in the order of ``storages_of``, lowest level, highest level, rms rate and
-how high a rim may be, flattened. A level that was recorded shows its rim; one that was simulated moves with the fit."""
+"""Name of a fact of a place: lowest level, highest level, rms rate and highest possible rim of each storage, flattened
+in the order of ``storages_of``. A recorded level shows its rim; a simulated one moves with the fit."""
 
 
 def _settings(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -42,25 +42,25 @@ def flow_pairs(settings: Settings) -> list[tuple[int, int]]:
 
 
 def storages_of(settings: Settings) -> list[int]:
-    """States that the flows depend on, each once."""
+    """Return the states that the flows depend on, each once."""
     return list(dict.fromkeys(a for a, _ in flow_pairs(settings)))
 
 
 def _spans(settings: Settings) -> list[tuple[float, float, float]]:
-    """Lowest level, highest level and rate of each storage. A twin file of one range holds it for all."""
+    """Return lowest level, highest level and rate of each storage. A twin file of one range uses it for all."""
     stores = storages_of(settings)
     ranges, rates = _by(2, settings.get("range", (0.0, 1.0))), settings.get("rate", (1.0,))
     return [(*ranges[min(i, len(ranges) - 1)], rates[min(i, len(rates) - 1)]) for i in range(len(stores))]  # pyright: ignore[reportReturnType]
 
 
 def level_names(name: str, settings: Settings) -> list[str]:
-    """The parameter of the level of each storage; states count from one where there are several."""
+    """Return the names of the level parameters; states count from one where there are several storages."""
     stores = storages_of(settings)
     return [name] if len(stores) == 1 else [f"{name}_{a + 1}" for a in stores]
 
 
 def _names(settings: Settings) -> list[str]:
-    """A name for each flow; states count from one."""
+    """Return a name for each flow; states count from one."""
     return [f"outflow_{a + 1}" if a == b else f"inflow_{b + 1}_from_{a + 1}" for a, b in flow_pairs(settings)]
 
 
@@ -90,7 +90,7 @@ def _root_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 
 def _level_by_flow(q: Array, settings: Settings) -> list[tuple[int, int, float]]:
-    """(state it depends on, state it changes, level) of each flow."""
+    """Return (state it depends on, state it changes, level) of each flow."""
     level = dict(zip(storages_of(settings), (float(v) for v in q), strict=True))
     return [(a, b, level[a]) for a, b in flow_pairs(settings)]
 

@@ -22,7 +22,7 @@ ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
 
 @kernel
 def friction_limit(v, sign, row, at):
-    """Largest friction at speed v in the direction of motion ``sign``: Coulomb, its asymmetry, Stribeck's extra.
+    """Return the largest friction at speed v in the direction ``sign``: Coulomb, its asymmetry, Stribeck's extra.
 
     F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3.
     The numbers of the family begin at ``row[at]``.
@@ -36,7 +36,7 @@ def friction_limit(v, sign, row, at):
 
 @kernel
 def bristle_after(z, v, step_s, row, at):
-    """Deflection of the bristles after ``step_s`` at the speed v: z' = v - sigma |v| z / g(v), exact for constant v.
+    """Return the bristle deflection after ``step_s`` at constant speed v, exactly: z' = v - sigma |v| z / g(v).
 
     C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4; g is
     ``friction_limit`` and sigma ``row[at + 5]``. With a lean (``row[at + 6]``) they are those of ``loop_after``.
@@ -55,7 +55,7 @@ def bristle_after(z, v, step_s, row, at):
 
 @kernel
 def loop_after(z, move, yielding, lean):
-    """Deflection of a Bouc-Wen element after a ``move`` in one direction: z' = v - (|v| z + lean v |z|) / yielding.
+    """Return the deflection of a Bouc-Wen element after a ``move``: z' = v - (|v| z + lean v |z|) / yielding.
 
     Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1, beta = 1 / yielding, gamma = lean beta. Exact: it relaxes
     at one rate towards zero and at another away from it. With lean < -1 it stiffens as it is loaded.
@@ -81,7 +81,7 @@ def loop_after(z, move, yielding, lean):
 
 @kernel
 def loop_along(x, yielding, lean, starts):
-    """Deflection (n,) of a Bouc-Wen element along the course x (n,), at rest at each start."""
+    """Return the deflection (n,) of a Bouc-Wen element along the course x (n,), at rest at each start."""
     out = np.zeros(x.size)
     at = 0
     for k in range(x.size):
@@ -94,9 +94,9 @@ def loop_along(x, yielding, lean, starts):
 
 @kernel
 def smooth_force(p, v, spring, cogging, friction, place):
-    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, gravity.
+    """Return the force continuous in position p and velocity v: spring curvature, drag, stops, cogging, gravity.
 
-    The rows of all places stand one behind the other; ``place`` says which of them is meant.
+    The rows of all places are concatenated; ``place`` is the index of the row.
     """
     k, c = place * SPRING, place * COGGING
     q = p * p
@@ -117,7 +117,7 @@ def smooth_force(p, v, spring, cogging, friction, place):
 
 @kernel
 def flow_of(x, law, strength, level):
-    """A flow that depends on one state x: its root or what stands above a level, its square, or the state itself."""
+    """Return the flow for a state x by ``law``: the root of x, x above a level, the square of x, or x itself."""
     over = x - level
     if law == 0.0:
         return strength * np.sqrt(over) if over > 0.0 else 0.0

@@ -14,7 +14,7 @@ from sim_devices.physics.statistics import least_squares, smooth, thin
 
 
 def velocity_of(x: Array, ctx: Context) -> Array:
-    """The recorded velocity, else the smoothed derivative of the position x (n,)."""
+    """Return the recorded velocity (n,), or the smoothed derivative of the position x (n,) where none was recorded."""
     v = ctx.signals.get("velocity")
     if v is not None:
         return v
@@ -22,12 +22,12 @@ def velocity_of(x: Array, ctx: Context) -> Array:
 
 
 def _still(v: Array) -> float:
-    """Speed below which a measured velocity is noise: a small part of what is usual."""
+    """Return the speed below which a measured velocity counts as noise: a small part of the usual speed."""
     return 0.02 * float(np.sqrt(np.mean(v * v))) or 1e-9
 
 
 def soft_sign(v: Array) -> Array:
-    """Sign of a measured velocity, gentle around zero where noise decides."""
+    """Return the sign of a measured velocity, smoothed around zero, where noise decides it."""
     return np.tanh(v / _still(v))
 
 
@@ -84,7 +84,7 @@ def _bristle_distance(settings: Settings) -> Parameter:
 
 
 def _bent(x: Array, ctx: Context, distance: float) -> Array:
-    """Bristles -1..1 along the recorded travel, (n,)."""
+    """Return the bristle deflection (n,), -1..1, along the recorded travel."""
     at = np.array(ctx.starts, np.int64)
     u = smooth(x, 5)
     return dahl(u, np.array([distance]), np.zeros(1), float(u[0]), at)[:, 0] / distance
@@ -111,7 +111,7 @@ def _lugre_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
 
 
 def _best_bristles(x: Array, residual: Array, ctx: Context, grid: Array) -> list[float]:
-    """Presliding distances of ``grid``, the one whose force meets the residual best first."""
+    """Rank the presliding distances of ``grid`` by how well their force fits the residual, best first."""
     k = thin(ctx.keep, 8000)
     tried: list[tuple[float, float]] = []
     for r in grid.tolist():
@@ -169,7 +169,7 @@ SMOOTH_SPRING = Effect(
 )
 
 LEANS = (-1.3, -0.6, 0.5)
-"""Where a search of the lean begins; at zero the element is the smooth spring."""
+"""Start values for the search of the lean. At zero the element is the smooth spring."""
 
 
 def _loop_parts(settings: Settings) -> Parts:

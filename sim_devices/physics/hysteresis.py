@@ -15,7 +15,7 @@ from sim_devices.physics.statistics import runs, signed_least_squares, thin
 
 N_PLAYS = 10
 FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays", "stops_curved")
-"""Bases from few to many columns; the data choose (``choose``). Each meets what the others meet badly:
+"""Bases from few to many columns; ``choose`` selects one by the data. Each fits loops that the others fit badly:
 
 stops        Prandtl-Ishlinskii, Maxwell-slip, Iwan
 dahl         smooth elements dz = dx - |dx| z / r: Dahl, Bouc-Wen with exponent one (gamma = 0)
@@ -135,14 +135,14 @@ WIDE = (1.3, 1.65)  # half ranges
 N_DAHL = 7
 N_GRID = 8
 ONE_WAY_ROUND = ("stops", "dahl", "dahl_stops", "relays", "stops_curved")
-"""Forms whose elements all have weights of one sign: every loop, a minor one too, is run through the same way round,
-because each takes energy and none gives any (Kuhnen 2003, section 2.2: weights of plays that are not negative)."""
+"""Forms whose elements all have weights of one sign. Every loop, also a minor one, has the same sense of rotation,
+because each element dissipates energy (Kuhnen 2003, section 2.2: the weights of plays are not negative)."""
 OF_ONE_LOOP = ("stops", "dahl", "dahl_stops", "stops_curved")
-"""Forms in which one outer loop says what every minor loop is (Masing's rule, about a middle line that may be bent)."""
+"""Forms in which the outer loop determines every minor loop (Masing's rule, about a middle line that may be bent)."""
 MASING = OF_ONE_LOOP[:3]
 SEVERAL_LOOPS = FORMS[:6]
 CURVES = 2
-"""Legendre polynomials of second degree and up in a curve beside stops."""
+"""Number of Legendre polynomials, from the second degree, in a curve beside stops."""
 
 
 def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
@@ -163,7 +163,7 @@ def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
 
 
 def turning_points(x: Array, least: float) -> list[float]:
-    """Values at which x (n,) turns by more than ``least``, without the ends."""
+    """Return the values at which x (n,) turns by more than ``least``, without the ends."""
     out: list[float] = []
     top = bottom = float(x[0])
     going = 0
@@ -182,15 +182,17 @@ def turning_points(x: Array, least: float) -> list[float]:
 
 @dataclass(frozen=True)
 class Bent:
-    """The loop x + sum of ``weights`` times elements that a curve behind them acts on, and its range. It is read off
-    the data once, so that the curve stays linear in its coefficients."""
+    """Holds the loop (x plus the sum of ``weights`` times elements) that a curve behind it acts on, and its range.
+
+    The loop is read off the data once, so that the curve stays linear in its coefficients.
+    """
 
     low: float
     high: float
     weights: tuple[float, ...] = ()
 
     def along(self, x: Array, elements: Array) -> Array:
-        """The loop (n,) for elements (n, k)."""
+        """Return the loop (n,) for elements (n, k)."""
         return x + elements @ np.array(self.weights) if self.weights else x
 
 
@@ -205,9 +207,10 @@ def columns(
     before: float | None = None,
     bent: Bent | None = None,
 ) -> Array:
-    """Columns of one form (n, k), every one without memory of what lies before a start, but for one way from ``rest``
-    to ``before`` and back. ``wide_too``: with elements of more than half the range. ``bent``: what a curve behind the
-    elements acts on.
+    """Return the columns (n, k) of a form.
+
+    No column remembers anything from before a start, except one move from ``rest`` to ``before`` and back.
+    ``wide_too`` adds elements wider than half the range. ``bent`` is the loop that a curve behind the elements acts on.
     """
     if before is not None:
         return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too, None, bent)[2:]
@@ -245,7 +248,7 @@ def slips_once(lo: float, hi: float, rest: float) -> bool:
 
 
 def width_of(form: str, wide_too: bool = False) -> int:
-    """Number of columns of a form."""
+    """Return the number of columns of a form."""
     more = len(WIDE) if wide_too else 0
     return {
         "stops": N_PLAYS + more,
@@ -259,7 +262,7 @@ def width_of(form: str, wide_too: bool = False) -> int:
 
 
 def signs_of(form: str, sign: float, count: int) -> Array:
-    """Signs (count,) of the weights of a form whose elements have the sign ``sign``; 0 where it may be either."""
+    """Return the signs (count,) of the weights of a form whose elements have the sign ``sign``; 0 leaves one free."""
     signs = np.full(count, sign if form in ONE_WAY_ROUND else 0.0)
     if form == "stops_curved":
         signs[-CURVES:] = 0.0
@@ -269,13 +272,16 @@ def signs_of(form: str, sign: float, count: int) -> Array:
 NEED = 0.93
 """Largest ratio of sums of squares at which a form with more columns, or a history, is preferred."""
 BEFORE = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
-"""Ways before a record that are tried, in its range."""
+"""Moves before a record that are tried, as fractions of its range."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """A form of memory: ``left`` the sum of squares on left-out blocks of what it predicts; ``before`` how far x went
-    before the record, if memory of that is in it; ``sign`` that of all weights, 0 where they may differ."""
+    """Holds a form of memory and its score.
+
+    ``left`` is the sum of squared prediction errors on left-out blocks; ``before`` is how far x moved before the
+    record, if the record shows it; ``sign`` is the sign of all weights, 0 where they may differ.
+    """
 
     left: float
     form: str
@@ -287,7 +293,7 @@ class Chosen:
 def left_out(
     x: Array, residual: Array, ctx: Context, form: str, lo: float, hi: float, before: float | None = None
 ) -> Chosen:
-    """One form tried on left-out blocks."""
+    """Return the form with its sum of squares on left-out blocks and the sign of its weights."""
     index = thin(ctx.keep, 6000)
     fold = (np.arange(index.size) * 8 // max(index.size, 1)) % 2
     straight = ctx.line(x, index)
@@ -312,7 +318,7 @@ def left_out(
 
 
 def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, *, wide: bool, before: float | None) -> Bent:
-    """The loop of stops that meets the output best."""
+    """Fit the loop of stops to the output."""
     index = thin(ctx.keep, 6000)
     e = columns(x, "stops", lo, hi, float(x[0]), ctx.starts, wide, before)
     through = [ctx.to_output(np.ascontiguousarray(c))[index] for c in (x, *e.T)]
@@ -326,8 +332,10 @@ def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, *, wi
 
 
 def choose(x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS) -> Chosen:
-    """The form that predicts left-out blocks best, a larger one only where it is clearly better; with a way before the
-    record only where that is clearly better: a record of several starts begins each without.
+    """Return the form that predicts left-out blocks best.
+
+    A larger form, or one with a move before the record, is chosen only where it is clearly better (``NEED``). A record
+    of several starts begins each of them without such a move.
     """
 
     def best_of(forms: Sequence[str], before: float | None) -> Chosen:
@@ -370,7 +378,7 @@ def way_before(settings: Settings) -> float | None:
 
 
 def bent_of(settings: Settings) -> Bent | None:
-    """Return what a curve behind the elements acts on."""
+    """Return the loop that a curve behind the elements acts on, or None if there is no such curve."""
     if "bent" not in settings:
         return None
     low, high, *weights = settings["bent"]
@@ -403,7 +411,7 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def loop_width(y_of: Array, turns: int) -> float:
-    """Largest distance of the two branches over the last of ``turns`` equal cycles, relative to the span."""
+    """Return the largest distance of the two branches over the last of ``turns`` equal cycles, relative to the span."""
     n = y_of.size // turns
     last = y_of[-n:]
     # sample i on the way up meets sample n - i on the way down
@@ -416,7 +424,7 @@ CYCLE = 200  # samples; even, so that both branches pass the same places
 
 
 def test_cycle(lo: float, hi: float) -> Array:
-    """Three slow triangles over the range."""
+    """Return three slow triangular cycles over the range."""
     t = np.arange(3 * CYCLE) / CYCLE
     return lo + (hi - lo) * (1 - np.abs(2 * (t % 1.0) - 1))
 

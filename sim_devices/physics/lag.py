@@ -113,7 +113,7 @@ def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Se
 
 def _twice_parts(settings: Settings) -> Parts:
     time_constant, settled = _ac_parts(settings).nonlinear
-    # names of their own: twin files tell forms by their parameters
+    # the names are unique, because twin files distinguish forms by their parameters
     return Parts(
         (
             replace(time_constant, name="period_by_2pi_s"),
@@ -130,7 +130,7 @@ def _twice_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     since = k - at[np.searchsorted(at, k, side="right") - 1]
     ad, g0, g1 = discrete_mode(1 / (2 * np.pi * tau), damping, ctx.dt)
     z = mode(x, ad, np.ascontiguousarray(g0), g1, at)
-    # what a start away from rest leaves: two poles, which must not meet
+    # the free response after a start away from rest has two poles; its formula needs them to differ
     apart = damping if abs(damping - 1.0) > 1e-8 else 1.0 + 1e-8
     root = np.sqrt(complex(apart * apart - 1.0))
     r, s = -apart - root, -apart + root
@@ -138,8 +138,8 @@ def _twice_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     fall, rise = np.exp(r * age), np.exp(s * age)
     free = np.real((s * fall - r * rise) / (s - r))
     speed = np.real(r * s * (fall - rise) / (s - r))
-    begun = (1 - settled) * x[k - since]
-    return x - (z[0] - begun * free) - 2 * damping * (z[1] - begun * speed)
+    unsettled = (1 - settled) * x[k - since]
+    return x - (z[0] - unsettled * free) - 2 * damping * (z[1] - unsettled * speed)
 
 
 def _twice_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:

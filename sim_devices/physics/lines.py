@@ -19,7 +19,7 @@ MOST_VALUES = 60_000_000  # columns times samples: half a gigabyte
 
 
 def tones(t: Array, frequency: float, orders: Sequence[float] = (1.0,)) -> Array:
-    """Sine and cosine of each harmonic, (n, 2 * orders)."""
+    """Return the sine and cosine of each harmonic, (n, 2 * orders)."""
     cols: list[Array] = []
     for h in orders:
         phase = 2 * np.pi * h * frequency * t
@@ -28,7 +28,7 @@ def tones(t: Array, frequency: float, orders: Sequence[float] = (1.0,)) -> Array
 
 
 def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
-    """Complex amplitude of a line in windows of ``width`` seconds, (windows,)."""
+    """Return the complex amplitude (windows,) of a line in windows of ``width`` seconds."""
     dt = t[1] - t[0]
     m = max(1, round(width / dt))
     c = (t.size // m) * m
@@ -37,21 +37,21 @@ def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
 
 
 def carrier_kept(keep: NDArray[np.bool_], dt: float, width: float) -> NDArray[np.bool_]:
-    """Windows of ``carrier`` that lie in the mask altogether, (windows,) bool."""
+    """Return the mask (windows,) of the windows of ``carrier`` that lie completely in ``keep``."""
     m = max(1, round(width / dt))
     c = (keep.size // m) * m
     return np.all(keep[:c].reshape(-1, m), axis=1)
 
 
 def periodogram(e: Array, keep: np.ndarray, dt: float) -> tuple[Array, Array]:
-    """Frequencies and power of the kept residual (gaps as zeros), finely spaced."""
+    """Return finely spaced frequencies and the power of the kept residual at them (gaps count as zeros)."""
     clean = np.where(keep, e - e[keep].mean(), 0.0)
     n = 1 << int(np.ceil(np.log2(2 * e.size)))
     return np.asarray(np.fft.rfftfreq(n, dt), np.float64), np.asarray(np.abs(np.fft.rfft(clean, n)) ** 2, np.float64)
 
 
 def local_floor(power: Array, around: int) -> Array:
-    """Running median of a spectrum in blocks: the noise under a line."""
+    """Return the running median of a spectrum in blocks: the noise under a line."""
     m = max(1, power.size // max(around, 1))
     width = power.size // m
     blocks = power[: m * width].reshape(m, width)
@@ -60,7 +60,7 @@ def local_floor(power: Array, around: int) -> Array:
 
 
 def _peak(x: Array, residual: Array, ctx: Context, lo: float, hi: float, driven: bool) -> tuple[float, float]:
-    """(frequency, power over the local floor) of the strongest line between lo and hi."""
+    """Find (frequency, power over the local floor) of the strongest line between lo and hi."""
     f, p = periodogram(residual, ctx.keep, ctx.dt)
     z = p / np.maximum(local_floor(p, 400), 1e-300)
     allowed = (f >= lo) & (f <= hi) & (f > 4 / (ctx.dt * ctx.t.size))
@@ -75,7 +75,7 @@ def _peak(x: Array, residual: Array, ctx: Context, lo: float, hi: float, driven:
 
 
 def _excited(x: Array, ctx: Context, f: Array) -> NDArray[np.bool_]:
-    """Frequencies where an input has a line of its own (a residual line there is a wrong response, not a visitor)."""
+    """Return a mask of the frequencies where an input has a line: a residual line there is a wrong response."""
     bad = np.zeros(f.size, bool)
     for name, s in ctx.signals.items():
         if float(np.ptp(s)) == 0 or name.startswith(("temperature", "supply")):
@@ -89,7 +89,7 @@ def _excited(x: Array, ctx: Context, f: Array) -> NDArray[np.bool_]:
 
 
 def mean_turn(z: NDArray[Any], whole: NDArray[np.bool_]) -> float:
-    """Mean turns from one window to the next of the phasors ``z`` (m,), where both are ``whole``."""
+    """Return the mean rotation, in turns per window, of the phasors ``z`` (m,) between adjacent ``whole`` windows."""
     pair = whole[1:] & whole[:-1]
     turned = complex(np.sum(z[1:][pair] * np.conj(z[:-1][pair])))
     return float(np.angle(turned)) / (2 * np.pi) if turned else 0.0
@@ -102,7 +102,7 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
     knots = 1
     if span > 8 * width:
         whole = carrier_kept(ctx.keep, ctx.dt, width)
-        # off its frequency a steady line seems to wander: the mean turn from window to window is taken off first
+        # a steady line seems to wander when the frequency is off: the mean rotation per window is removed first
         f0 += mean_turn(carrier(ctx.t, residual, f0, width), whole) / width
         z = carrier(ctx.t, residual, f0, width)
         power = float(np.mean(np.abs(z[whole]) ** 2)) if whole.sum() > 8 else 0.0
@@ -120,7 +120,7 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
 
 
 def _orders(residual: Array, ctx: Context, f0: float, harmonics: int) -> tuple[float, ...]:
-    """The fundamental and those harmonics that stand out of the spectrum."""
+    """Return the orders of the fundamental and of the harmonics that stand out of the spectrum."""
     f, p = periodogram(residual, ctx.keep, ctx.dt)
     z = p / np.maximum(local_floor(p, 400), 1e-300)
     out = [1.0]
@@ -199,8 +199,9 @@ def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
 
 
 def mean_spread(deviation: Array, weight: Array) -> float:
-    """Standard deviation of a weighted mean (of values that deviate so from it, (m,)), neighbours alike as much as they
-    are found to be: of m values about m (1 - r) / (1 + r) count, r the correlation of neighbours (Bartlett, J. Royal
+    """Return the standard deviation of a weighted mean from the deviations (m,) of correlated values.
+
+    The effective number of values is m (1 - r) / (1 + r), with r the correlation of neighbours (Bartlett, J. Royal
     Statistical Society 98, 1935).
     """
     power = float(np.sum(weight * deviation**2) / max(float(np.sum(weight)), 1e-300))
@@ -211,7 +212,7 @@ def mean_spread(deviation: Array, weight: Array) -> float:
 
 
 def _line_signature(z: float, f: float, trials: float, residual: Array, ctx: Context) -> Signature:
-    """A single bin of a white stretch of spectrum is exponential: p = trials exp(-z)."""
+    """Return the test of a spectral line: a bin of a white spectrum is exponential, so p = trials exp(-z)."""
     k = thin(ctx.keep, 40_000)
     if f <= 0:
         return Signature(1.0, 0.0, "no line")
@@ -220,7 +221,7 @@ def _line_signature(z: float, f: float, trials: float, residual: Array, ctx: Con
     w = np.linalg.lstsq(cols, e, rcond=None)[0]
     power = float(e @ e)
     share = 1 - float(np.sum((e - cols @ w) ** 2)) / power if power > 0 else 0.0
-    # the floor is itself estimated and coloured: count a quarter of the excess
+    # the floor is estimated and coloured, so only a quarter of the excess counts
     return Signature(float(min(1.0, trials * gammaincc(1.0, 0.5 * z))), max(share, 0.0), f"line at {f:.4g} Hz")
 
 

@@ -9,21 +9,22 @@ import numpy as np
 from sim_devices.physics.effect import Array
 
 ALIKE = 0.05
-"""Largest rms difference between two periods, over the rms of the signal times the root of two: an input that was
-measured and not commanded repeats up to its own noise."""
+"""Largest rms difference between two periods, relative to the rms of the signal times the root of two. It is not zero,
+because a measured input repeats only up to its noise."""
 
 
 @dataclass(frozen=True)
 class Period:
-    """``samples``: the fundamental period, not always a whole number. ``lag``: the whole number of samples, one or a
-    few periods, after which the signal differs least from itself."""
+    """Holds a period: ``samples`` is the fundamental period, not always a whole number; ``lag`` is the whole number of
+    samples, one or a few periods, after which the signal differs least from itself.
+    """
 
     samples: float
     lag: int
 
 
 def period_of(x: Array, *, alike: float = ALIKE) -> Period | None:
-    """The period of ``x`` (n,), when it repeats at least twice within the record; None otherwise.
+    """Return the period of ``x`` (n,) if it repeats at least twice within the record, else None.
 
     Lags are proposed by the autocorrelation and judged by the difference of the signal from itself.
     """
@@ -57,21 +58,22 @@ def period_of(x: Array, *, alike: float = ALIKE) -> Period | None:
 
 
 def _difference(x: Array, lag: int) -> float:
-    """Rms difference of ``x`` (n,) from itself ``lag`` samples later, over the root of two."""
+    """Return the rms difference of ``x`` (n,) from itself ``lag`` samples later, over the root of two."""
     return float(np.sqrt(np.mean((x[lag:] - x[:-lag]) ** 2) / 2))
 
 
 def _refined(x: Array, lag: int) -> float:
-    """The lag of least difference between the samples: near it the mean square is a parabola."""
+    """Return the lag of least difference, refined between samples: near it the mean square is a parabola."""
     a, b, c = (_difference(x, k) ** 2 for k in (lag - 1, lag, lag + 1))
     bend = a - 2 * b + c
     return lag + (0.5 * (a - c) / bend if bend > 0 else 0.0)
 
 
 def locked_p_value(at: Array, period: float) -> float:
-    """Probability that events at samples ``at`` (k,) crowd at one, two or four phases of the period as much as they do,
-    if they came at random (N. I. Fisher, Statistical Analysis of Circular Data, 1993, section 4.3: Rayleigh's test,
-    three multiples tried).
+    """Return the p-value of the null hypothesis that events at samples ``at`` (k,) have random phases of the period.
+
+    The alternative is that they cluster at one, two or four phases (Rayleigh's test at three multiples: N. I. Fisher,
+    Statistical Analysis of Circular Data, 1993, section 4.3).
     """
     k = at.size
     if k < 3 or period <= 0.0:

@@ -1,4 +1,4 @@
-"""Quantisation: a grid that is seen in the readings themselves, bare or under noise that came after it."""
+"""Quantisation: a grid that the readings show, exactly or under noise that was added after the rounding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ GRID_TOLERANCE = 0.06  # of a step: a finer grid may lie over the coarse one
 
 
 def find_step(y: Array) -> float:
-    """The grid on which all values of y lie, 0 if there is none that is coarser than rounding in a text file."""
+    """Return the step of the grid on which all values of y lie; 0 if none is coarser than rounding in a text file."""
     values = np.unique(y)
     if values.size < 2:
         return 0.0
@@ -41,8 +41,9 @@ STEPS = (0.5, 4.2)  # of the residual's rms: q / sqrt(12) is all of it at most, 
 
 
 def find_lumps(y: Array, x: Array, rms: float) -> tuple[float, float, float]:
-    """(step, origin, p) of a grid under noise that came after the rounding: y (n,) gathers at multiples of a step while
-    the model's output x (n,) does not; step 0 if there is none. ``rms`` of the residual.
+    """Find (step, origin, p) of a grid under noise that was added after the rounding; step 0 if there is none.
+
+    y (n,) clusters at multiples of the step while the model's output x (n,) does not. ``rms`` is that of the residual.
 
     The characteristic function of y at 1 / step is exp(-2 (pi s / step)^2) for noise of rms s, and next to nothing
     for a smooth distribution (Widrow, Kollar 2008, eq. 4.11). A passage from one cell to the next counts as one sample.
@@ -97,7 +98,7 @@ def _grid_parts(settings: Settings) -> Parts:
 
 
 def mean_of_steps(x: Array, step: float, origin: float, dither: float) -> Array:
-    """Expected reading of a rounding quantiser when noise of rms ``dither`` precedes it.
+    """Return the expected reading of a rounding quantiser that noise of rms ``dither`` precedes.
 
     B. Widrow, I. Kollar, Quantization Noise (2008), eq. 16.14: x + step/pi sum (-1)^k/k sin(2 pi k x/step) e^(...).
     """

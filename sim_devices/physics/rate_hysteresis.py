@@ -26,7 +26,7 @@ N_DAHL = 5
 
 
 def speed(x: Array, dt: float, usual: float) -> Array:
-    """Slope of x relative to its usual size, compressed: log(1 + |x'|/usual)."""
+    """Return the compressed slope of x relative to its usual size: log(1 + |x'|/usual)."""
     slope = smooth(np.gradient(x, dt), 3)
     return np.log1p(np.abs(slope) / usual)
 

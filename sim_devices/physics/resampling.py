@@ -36,7 +36,7 @@ def resample(x, first, step, bend):
 
 @kernel
 def resample_straight(x, first, step, bend):
-    """The same on straight lines between samples, as a held or played-back signal runs; edges are held."""
+    """Resample as ``resample`` does, on straight lines between samples, as a played-back signal runs."""
     n = x.size
     y = np.empty(n)
     for k in range(n):
@@ -52,7 +52,7 @@ def resample_straight(x, first, step, bend):
 
 
 def delay_by_correlation(x: Array, y: Array, longest: int) -> float:
-    """Samples by which y is late against x, from the peak of their differences' cross-correlation, refined."""
+    """Return the samples by which y lags x, from the refined peak of the cross-correlation of their differences."""
     n = x.size
     a, b = np.diff(x - x.mean()), np.diff(y - y.mean())
     size = 1 << int(np.ceil(np.log2(2 * n)))

@@ -17,8 +17,10 @@ SUBSTEPS = 8  # where a limited course meets its input again lies between sample
 
 @kernel
 def slew(x, down, up, share, starts, parts, rounded):
-    """Move towards x, straight between samples, in ``parts`` steps per sample: by ``share`` of the distance, at most
-    ``up`` and ``down`` a step, ``rounded`` by a hyperbolic tangent or not; on x at each start.
+    """Follow x at a limited rate; x runs straight between samples and each sample is divided into ``parts`` steps.
+
+    A step moves by ``share`` of the distance, by at most ``up`` or ``down``; ``rounded`` smooths the limit by a
+    hyperbolic tangent. The output equals x at each start.
     """
     y = np.empty_like(x)
     s = 0

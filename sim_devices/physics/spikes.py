@@ -20,7 +20,10 @@ LOCKED = 1e-3  # p-value of Rayleigh's test below which bursts belong to the pha
 
 
 def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
-    """[start, stop) and peak of each burst: innovations beyond six robust rms, grown until the level is usual."""
+    """Return [start, stop) and peak of each burst.
+
+    A burst is a run of innovations beyond six robust rms, extended until the level is usual again.
+    """
     n = residual.size
     w = whiten(residual, keep, 8)
     scale = robust_rms(w[keep])
@@ -45,7 +48,7 @@ def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int
         a, b = int(group[0]), int(group[-1]) + 1
         around = np.concatenate([residual[max(0, a - 60) : max(1, a - 5)], residual[b + 5 : b + 60]])
         local = float(np.median(around)) if around.size else 0.0
-        # no further than a burst is short: the level there may be another one
+        # the extension is bounded by the length of a short burst: the level may have changed there
         first, last = max(0, a - longest), min(n, b + longest)
         while a > first and abs(residual[a - 1] - local) > 2.5 * usual:
             a -= 1
@@ -68,8 +71,11 @@ def _where(ctx: Context, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def not_driven(bursts: list[tuple[int, int, float]], ctx: Context) -> list[tuple[int, int, float]]:
-    """Bursts less those that begin at a jump of a signal, when more do so than chance has it: a response. None where
-    they keep to the phase of an input that repeats: the misfit of a loop comes back in every period.
+    """Return the bursts that no input causes.
+
+    Bursts that begin at a jump of a signal are responses and are removed when more of them do so than chance allows.
+    The result is empty where the bursts keep to the phase of a periodic input: the misfit of a loop recurs in every
+    period.
     """
     lively = after_jumps(ctx.signals.values(), ctx.t.size, 0.1)
     at = np.array([lively[min(a + 2, lively.size - 1)] for a, _, _ in bursts], np.bool_)
@@ -95,7 +101,7 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 
 def claims(settings: Settings, n: int) -> NDArray[np.bool_]:
-    """Samples inside bursts, (n,)."""
+    """Return the mask (n,) of the samples inside bursts."""
     out = np.zeros(n, np.bool_)
     for a, b in zip(settings.get("starts", ()), settings.get("stops", ()), strict=True):
         out[int(a) : int(b)] = True
@@ -111,20 +117,20 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _test(x: Array, residual: Array, ctx: Context) -> Signature:
-    """Bursts beyond what heavy tails of the rest allow: Student-t with 4 degrees of freedom as the null.
+    """Test bursts against heavy-tailed noise: Student's t with 4 degrees of freedom is the null distribution.
 
-    The whole record is looked at: no parameter is fitted, and a few bursts may all lie in what is held out.
+    The test uses the whole record, because it fits no parameter and a few bursts may all lie in the held-out set.
     """
     residual, keep = _where(ctx, residual)
     bursts = not_driven(find_bursts(residual, keep), ctx)
     if not bursts:
         return Signature(1.0, 0.0, "no burst")
-    taken = np.zeros(residual.size, np.bool_)
+    in_burst = np.zeros(residual.size, np.bool_)
     for a, b, _ in bursts:
-        taken[a:b] = True
+        in_burst[a:b] = True
     e = residual[keep] - np.median(residual[keep])
     power = float(e @ e)
-    inside = taken[keep]
+    inside = in_burst[keep]
     share = float(e[inside] @ e[inside]) / power if power > 0 else 0.0
     w = whiten(residual, keep, 8)
     scale = robust_rms(w[keep]) or 1.0
@@ -134,10 +140,10 @@ def _test(x: Array, residual: Array, ctx: Context) -> Signature:
     p = min(1.0, keep.sum() * 2 * float(student.sf(typical[0] * 0.74, 4)))
     width = np.mean([b - a for a, b, _ in bursts])
     if width > 2.5:
-        # neighbours far out together do not happen to independent noise
+        # in independent noise, neighbours are not outliers together
         p = p * p if p < 1 else 1e-3
         if len(bursts) > 2:
-            # nor several times (once is a start or a lost sample); what is less may be the filter's ringing
+            # nor does that repeat (once is a start or a lost sample); smaller neighbours may be the filter's ringing
             beside = typical[: int(np.sum(typical > max(4.0, 0.2 * typical[0])))][:4]
             p = min(p, 2 * keep.sum() * float(np.prod(2 * student.sf(beside * 0.74, 4))))
     return Signature(float(p), share, f"{len(bursts)} bursts, {width:.1f} samples wide")

@@ -155,7 +155,7 @@ def _cog_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tuple[float, float]]:
-    """(misfit, period), best first, over a grid on which the phase turns by a quarter over the travel, then finer."""
+    """Return (misfit, period), best first, on a grid with phase steps of a quarter turn over the travel, then finer."""
     k = thin(ctx.keep, 4000)
     line = np.stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))], axis=1)
 
@@ -221,7 +221,7 @@ COGGING_FORCE = Effect(
 
 
 LEAST_TURNED = 0.5
-"""Turns over which a load has to be seen: over less, its sine is a spring that softens."""
+"""Least number of turns over which a load must be seen: over fewer, its sine looks like a softening spring."""
 
 
 def _lever_parts(settings: Settings) -> Parts:

@@ -16,18 +16,18 @@ Bool = NDArray[np.bool_]
 
 
 def robust_rms(x: Array) -> float:
-    """1.4826 times the median absolute deviation."""
+    """Return 1.4826 times the median absolute deviation."""
     return 1.4826 * float(np.median(np.abs(x - np.median(x)))) if x.size else 0.0
 
 
 def runs(mask: Bool) -> list[tuple[int, int]]:
-    """Stretches [start, stop) where the mask is true."""
+    """Return the stretches [start, stop) where the mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def autoregression(x: Array, order: int) -> Array:
-    """Coefficients a (order + 1,), a[0] = 1, such that filtering x with them leaves innovations (Yule-Walker)."""
+    """Return coefficients a (order + 1,), a[0] = 1, that filter x into its innovations (Yule-Walker)."""
     n = x.size
     if n < 4 * order or order < 1:
         return np.ones(1)
@@ -41,7 +41,7 @@ def autoregression(x: Array, order: int) -> Array:
 
 
 def whiten(x: Array, mask: Bool | None = None, order: int = 10) -> Array:
-    """Innovations of x (n,) by an autoregression estimated where the mask is true; zero at the start of each run."""
+    """Return the innovations (n,) of x by an autoregression fitted where the mask is true; 0 at the start of a run."""
     stretches = runs(np.ones(x.size, np.bool_) if mask is None else mask)
     longest = max(stretches, key=lambda s: s[1] - s[0], default=(0, 0))
     a = autoregression(np.clip(x[slice(*longest)], *_fences(x[slice(*longest)])), order)
@@ -61,7 +61,7 @@ def _fences(x: Array) -> tuple[float, float]:
 
 
 def jumps(x: Array) -> NDArray[np.int64]:
-    """Samples at which a signal that is quiet otherwise has jumped: the levels of a staircase, a saw's flyback."""
+    """Return the samples at which an otherwise smooth signal jumps, such as a staircase or a sawtooth's flyback."""
     d = np.abs(np.diff(x))
     if d.size == 0:
         return np.zeros(0, np.int64)
@@ -69,8 +69,9 @@ def jumps(x: Array) -> NDArray[np.int64]:
 
 
 def after_jumps(signals: Iterable[Array], n: int, most: float = 0.2) -> Bool:
-    """(n,) true in a short stretch after each jump of any signal, one sample before included; all stretches
-    together are no more than about ``most`` of the record.
+    """Return a mask (n,) that is true in a short stretch after each jump of any signal and one sample before it.
+
+    All stretches together cover at most about ``most`` of the record.
     """
     out = np.zeros(n, np.bool_)
     every = [j for x in signals for j in jumps(x)]
@@ -83,15 +84,15 @@ def after_jumps(signals: Iterable[Array], n: int, most: float = 0.2) -> Bool:
 
 
 BLOCKS = (64, 32, 16)
-"""Numbers of blocks in which a long-run variance is looked for."""
+"""Numbers of blocks from which a long-run variance is estimated."""
 
 
 def long_run_rms(x: Array) -> float:
-    """Square root of the spectral density at zero, per sample, from differences of neighbouring block means.
+    """Return the square root of the spectral density at zero, per sample, from differences of adjacent block means.
 
-    Steps and drifts hardly change it, since one of many differences is robustly ignored. Blocks that are shorter than
-    the memory of ``x`` say too little, so the largest of several lengths counts (blocking: H. Flyvbjerg, H. G.
-    Petersen, J. Chem. Phys. 91, 1989, 461).
+    Steps and drifts hardly change it, because the estimate is robust against one of many differences. Blocks shorter
+    than the memory of ``x`` underestimate it, so the largest over several block lengths is returned (blocking: H.
+    Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 1989, 461).
     """
     found = [_by_blocks(x, max(1, x.size // blocks)) for blocks in BLOCKS]
     return max((f for f in found if f is not None), default=float(np.std(x)))
@@ -104,7 +105,7 @@ def _by_blocks(x: Array, length: int) -> float | None:
 
 
 def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array, float]:
-    """Coefficients and the residual sum of squares; columns (n, k) are scaled first, ``ridge`` is relative."""
+    """Return coefficients and residual sum of squares; columns (n, k) are scaled first, ``ridge`` is relative."""
     size = np.sqrt(np.sum(columns * columns, axis=0))
     size[size == 0] = 1.0
     q = columns / size
@@ -116,8 +117,9 @@ def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array
 
 
 def signed_least_squares(columns: Array, y: Array, signs: Array, ridge: float = 1e-10) -> Array:
-    """Coefficients of least squares that have the signs ``signs`` (k,), or are zero; 0 leaves a coefficient free (C. L.
-    Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    """Return the least-squares coefficients whose signs are ``signs`` (k,) or which are zero; 0 leaves one free.
+
+    C. L. Lawson, R. J. Hanson, Solving Least Squares Problems (1974), chapter 23.
     """
     size = np.sqrt(np.sum(columns * columns, axis=0))
     size[size == 0] = 1.0
@@ -129,9 +131,9 @@ def signed_least_squares(columns: Array, y: Array, signs: Array, ridge: float = 
 
 
 def bounded_solution(gram: Array, cross: Array, low: Array, high: Array) -> Array:
-    """The ``w`` between ``low`` and ``high`` with the least ``w gram w - 2 w cross``; ``gram`` is positive definite.
+    """Return the ``w`` between ``low`` and ``high`` that minimises ``w gram w - 2 w cross`` (``gram`` > 0).
 
-    Coefficients that leave the bounds are held there and the rest is solved again, until none wants to come back
+    Coefficients that leave the bounds are fixed there and the rest is solved again, until the gradient releases none
     (bounded-variable least squares: P. B. Stark, R. L. Parker, Computational Statistics 10, 1995, 129).
     """
     w = np.asarray(np.linalg.solve(gram, cross), np.float64)
@@ -142,13 +144,13 @@ def bounded_solution(gram: Array, cross: Array, low: Array, high: Array) -> Arra
 
 
 def thin(ctx_keep: Bool, at_most: int = 20_000) -> NDArray[np.int64]:
-    """Indices where the mask is true, at most so many, evenly spread."""
+    """Return at most ``at_most`` indices where the mask is true, evenly spread."""
     index = np.flatnonzero(ctx_keep)
     return index[:: max(1, index.size // at_most)]
 
 
 def smooth(x: Array, width: int) -> Array:
-    """Centred moving average over an odd ``width``; edges by the mean of what is there."""
+    """Return the centred moving average over an odd ``width``; at the edges it averages the samples that exist."""
     width = max(1, width | 1)
     if width == 1 or x.size < width:
         return x.copy()
@@ -160,7 +162,7 @@ def smooth(x: Array, width: int) -> Array:
 
 
 def affine_misfit(candidate: Array, measured: Array, beside: Array | None = None) -> float:
-    """Sum of squares left when ``a + b candidate`` is fitted to the measured samples, with the columns ``beside``."""
+    """Return the residual sum of squares of fitting ``a + b candidate`` and the columns ``beside`` to ``measured``."""
     columns = np.column_stack([np.ones(candidate.size), candidate])
     return least_squares(columns if beside is None else np.column_stack([columns, beside]), measured)[1]
 
@@ -172,10 +174,10 @@ def rank_starts(
     k: NDArray[np.int64],
     bends: Array | None = None,
 ) -> list[tuple[float, ...]]:
-    """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first.
-    ``bends`` (n, j): columns that may be added to each.
+    """Rank candidates by how well their output, scaled and offset, fits the measured samples at ``k``; best first.
 
-    Of candidates within half a percent, the one that is listed first.
+    ``bends`` (n, j) are columns that may be added to each. Among candidates within half a percent, the one that is
+    listed first wins.
     """
     beside = None if bends is None else bends[k]
     found = [(affine_misfit(output_of(q)[k], measured[k], beside), i) for i, q in enumerate(candidates)]
@@ -184,6 +186,6 @@ def rank_starts(
 
 
 def value_range(x: Array) -> tuple[float, float]:
-    """(least, largest) of x; a unit wide about a signal that stands still."""
+    """Return (least, largest) of x; the range is one unit wide about a constant signal."""
     lo, hi = float(x.min()), float(x.max())
     return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)

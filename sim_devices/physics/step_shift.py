@@ -1,4 +1,4 @@
-"""Changes of level that stay: where they are read off the data, and how high they are fitted."""
+"""Permanent changes of level: their instants are read off the data and their heights are fitted."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def best_split(total, count):
 
 
 def find_steps(residual: Array, keep: np.ndarray) -> tuple[list[int], float, float]:
-    """(samples where the level jumps, largest standardised CUSUM, share explained), by binary segmentation.
+    """Find (samples where the level jumps, largest standardised CUSUM, share explained) by binary segmentation.
 
-    The price of a step is in units of the long-run variance, which coloured noise has more of.
+    The price of a step is in units of the long-run variance, which is larger for coloured noise.
     """
     e = np.where(keep, residual, 0.0)
     n = e.size
@@ -78,9 +78,10 @@ LEAST_HEIGHT = 5.0  # standard errors of a step in the joint fit of all
 
 
 def paying_steps(residual: Array, keep: np.ndarray, cuts: Sequence[int], signal: Array) -> list[int]:
-    """Steps that stand when all are fitted together with the level and the gain of ``signal`` (n,).
+    """Return the steps that stay significant when all are fitted with the level and the gain of ``signal`` (n,).
 
-    Base parameters that a step has bent leave a swing all over the record, which segmentation takes for small steps.
+    A step biases the base parameters. The bias shows as a swing over the whole record, which segmentation would take
+    for small steps.
     """
     cuts = list(cuts)
     e = residual[keep]
@@ -102,7 +103,7 @@ def paying_steps(residual: Array, keep: np.ndarray, cuts: Sequence[int], signal:
 
 
 def _refine(residual: Array, keep: np.ndarray, at: int, size: int) -> int:
-    """The sample where two means around ``at`` part best."""
+    """Return the sample near ``at`` that separates two means best."""
     reach = max(4 * size, 40)
     a, b = max(0, at - reach), min(residual.size, at + reach)
     k = keep[a:b]
@@ -114,14 +115,14 @@ def _step_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     cuts, _, _ = find_steps(residual, ctx.keep)
     cuts = paying_steps(residual, ctx.keep, cuts, ctx.to_output(x))
     if ctx.everywhere is not None:
-        # that there is a step is known from the mask; where in a gap of it, only the gap can say
+        # the masked samples show that there is a step; its instant within a gap is read from the gap itself
         cuts = [_in_gap(ctx.everywhere, ctx.keep, c) for c in cuts]
     # several cuts of a slow change may meet in one gap
     return {"times_s": tuple(float(ctx.t[c]) for c in sorted(set(cuts))), "time": (ctx.dt, ctx.dt * ctx.t.size)}
 
 
 def _in_gap(everywhere: Array, keep: np.ndarray, at: int) -> int:
-    """The cut moved to where it fits best inside the gap that it touches, if it touches one."""
+    """Return the cut, moved to its best place inside the gap that it touches, if it touches one."""
     reach = 40
     near = np.flatnonzero(~keep[max(0, at - reach) : at + reach])
     if near.size == 0:
@@ -164,7 +165,7 @@ def _edge_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 
 def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
-    """Largest CUSUM against the Brownian bridge (Kolmogorov's distribution)."""
+    """Test the largest CUSUM against the Brownian bridge (Kolmogorov's distribution)."""
     e = residual[ctx.keep]
     if e.size < 50:
         return Signature(1.0, 0.0)
@@ -213,11 +214,10 @@ _EDGE = "edge_s"
 
 
 def edges(residual: Array, ctx: Context) -> tuple[list[int], float]:
-    """(samples where the residual jumps at once and stays, least innovation there over the largest elsewhere). Empty
-    when there are many: then it is no rare change of level.
+    """Find (samples at which the residual jumps and stays, least innovation there over the largest elsewhere).
 
-    Levels say where slow changes are, too, of which a base that is off has many; an edge is nothing slow: the level
-    changes by as much as it jumps.
+    The list is empty when there are many jumps, because a change of level is rare. Levels alone also respond to slow
+    changes, which wrong base parameters cause; at an edge the level changes by as much as the residual jumps.
     """
     whole = ctx.everywhere if ctx.everywhere is not None else residual
     keep = np.ones(whole.size, np.bool_) if ctx.everywhere is not None else ctx.keep
@@ -249,7 +249,7 @@ def _edge_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 
 def _edge_parts(settings: Settings) -> Parts:
-    # a name of its own: twin files tell forms by their parameters
+    # the name is unique, because twin files distinguish forms by their parameters
     parts = _step_parts(settings)
     rise = parts.nonlinear[0]
     return Parts(

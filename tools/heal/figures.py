@@ -26,17 +26,17 @@ LEAST_FALL = 0.01
 
 @dataclass(frozen=True)
 class TipError:
-    """Rms of the tip's error against the intended path, um, by band: one value per seed (seeds,)."""
+    """Holds the rms of the tip's error against the intended path, um, by band: one value per seed (seeds,)."""
 
     bands: Mapping[str, Array]
 
     def mean(self) -> dict[str, float]:
-        """The mean over seeds, by band."""
+        """Return the mean over seeds, by band."""
         return {b: float(np.mean(v)) for b, v in self.bands.items()}
 
 
 def tip_error(bench: BenchFile, seconds: float, seeds: Sequence[int]) -> TipError:
-    """Run the bench without wires for each seed. InputError for a bench that has no such run, or too short a run."""
+    """Run the bench in virtual time for each seed. Raises InputError if it has no such run or the run is too short."""
     out: dict[str, list[float]] = {b: [] for b in (*BANDS, WHOLE)}
     for seed in seeds:
         run = simulate(bench, seconds, seed=seed)
@@ -49,7 +49,7 @@ def tip_error(bench: BenchFile, seconds: float, seeds: Sequence[int]) -> TipErro
 
 
 def is_better(before: TipError, after: TipError) -> tuple[bool, str]:
-    """Return if ``after`` is better than ``before`` on the same seeds, and why in words (paired t-tests at ``LEVEL``).
+    """Decide by paired t-tests at ``LEVEL`` if ``after`` is better than ``before`` on the same seeds; give the reason.
 
     The error from 2 to 500 Hz, in which the bands above 2 Hz count by their power, must fall by ``LEAST_FALL`` or more,
     and the error below 2 Hz must not rise. A band above 2 Hz that rises although the whole falls is named.
@@ -66,7 +66,7 @@ def is_better(before: TipError, after: TipError) -> tuple[bool, str]:
 
 
 def _p_above_zero(x: Array) -> float:
-    """One-sided p-value that the mean of ``x`` is not above zero."""
+    """Return the one-sided p-value of the null hypothesis that the mean of ``x`` is not above zero."""
     if float(np.ptp(x)) == 0.0:
         return 0.0 if x[0] > 0.0 else 1.0
     t = float(np.mean(x)) / (float(np.std(x, ddof=1)) / np.sqrt(x.size))

@@ -24,15 +24,16 @@ STACK_EFFECTS = frozenset(
         "saturation", "first_order_lag", "resonance", "dead_time",
     )
 )  # fmt: skip
-"""Effects of a stack that the firmware's inverse (loops, creep, curve) or its feedforward (lag, resonance) undoes."""
+"""Effects of a stack that the firmware's inverse (loops, creep, curve) or feedforward (lag, resonance) compensates."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Step:
-    """One part: what differed, the effects that the engine named, whether its remedy was kept, and why. ``no_remedy``:
-    named effects that the firmware has nothing against.
+    """Records the treatment of a part: misfit, effects that the engine named, and if and why its remedy was kept.
+
+    ``no_remedy`` lists the named effects that the firmware cannot compensate.
     """
 
     part: str
@@ -47,7 +48,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Healed:
-    """``before`` and ``after``: mean tip error (um) by band over the same seeds; ``bench``: the healed file, if any."""
+    """Holds the mean tip error (um) by band ``before`` and ``after`` over the same seeds, and the healed file."""
 
     original: str
     bench: str | None
@@ -58,12 +59,12 @@ class Healed:
     steps: tuple[Step, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON of the command."""
+        """Return the JSON of the command."""
         return {"format": 1, **asdict(self)}
 
 
 def check_bench(bench: BenchFile, max_effect: int | None) -> None:
-    """InputError for a bench that cannot be healed: a real one, one with sensors that the lab does not know."""
+    """Raise InputError for a bench that cannot be healed: a real one, or one with sensors unknown to the lab."""
     if not all(bus.uri.startswith(SIM_SCHEME) for bus in bench.description.bus.values()):
         if max_effect is None:
             raise InputError(
@@ -120,8 +121,9 @@ def heal(
 
 
 def with_remedy(bench: BenchFile, file: Path, out: Path) -> BenchFile:
-    """The bench with one more calibration. Where the preview of the stacks changes, the horizon of the tremor estimator
-    changes by as much.
+    """Return the bench with one more calibration.
+
+    If the preview of the stacks changes, the horizon of the tremor estimator changes by the same amount.
     """
     from firmware_py.control.plan import load_plan
 

@@ -1,4 +1,4 @@
-"""Compares what the lab measures of stacks, manipulator and sensors with what the firmware believes of each.
+"""Compares the lab's measurements of stacks, manipulator and sensors with the firmware's models of them.
 
 Each part is compared on a recording of its own before anything is identified; the remedy is the calibration that
 ``micron calibrate`` would write from the lab's set of recordings.
@@ -48,7 +48,7 @@ GRID = 5
 
 @dataclass(frozen=True)
 class Lab:
-    """The emulated bench and its reference instruments. ``seed`` draws their noise."""
+    """Holds the emulated bench and its reference instruments. ``seed`` draws their noise."""
 
     bench: BenchFile
     config: EmulationConfig
@@ -57,8 +57,9 @@ class Lab:
 
 @dataclass(frozen=True)
 class Comparison:
-    """``rms`` of measured less believed, in ``unit``; ``recording``: for the engine, with the believed course as its
-    simulated column.
+    """Holds the ``rms`` of measured less modelled values, in ``unit``.
+
+    ``recording`` is for the engine; the modelled course is its simulated column.
     """
 
     rms: float
@@ -68,7 +69,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Part:
-    """``compare`` measures and compares; ``identify`` writes the calibration to a folder and returns it."""
+    """Describes a part: ``compare`` measures and compares it, ``identify`` writes its calibration to a folder."""
 
     name: str
     compare: Callable[[Lab], Comparison]
@@ -85,25 +86,25 @@ def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: 
 
 
 def compare_stacks(lab: Lab) -> Comparison:
-    """The worst stack against the firmware's model of it, about the mean of both."""
+    """Compare each stack with the firmware's model of it, about the mean of both, and return the worst."""
     worst: tuple[float, Recording] | None = None
     for axis, believed in enumerate(_stack_configs(lab.bench)):
         parts = [_measured_stack(lab, axis, p, hz, CHECK_S, AMPLITUDE_V) for p, hz in PROFILES]
         predicted = [predict_stroke(believed, p["command_V"]) for p in parts]
-        for part, said in zip(parts, predicted, strict=True):
-            away = part["displacement_um"] - said
+        for part, modelled in zip(parts, predicted, strict=True):
+            away = part["displacement_um"] - modelled
             rms = float(np.std(away))
             if worst is None or rms > worst[0]:
-                worst = (rms, _as_columns(lab, axis, part, said))
+                worst = (rms, _as_columns(lab, axis, part, modelled))
     assert worst is not None
     return Comparison(worst[0], "um", worst[1])
 
 
-def _as_columns(lab: Lab, axis: int, part: dict[str, Any], said: np.ndarray) -> Recording:
+def _as_columns(lab: Lab, axis: int, part: dict[str, Any], modelled: np.ndarray) -> Recording:
     step = round(1000.0 / CHECK_HZ)
     columns = {
         "command_V": part["command_V"][::step],
-        "believed_um": said[::step] - said.mean() + part["displacement_um"].mean(),
+        "believed_um": modelled[::step] - modelled.mean() + part["displacement_um"].mean(),
         "displacement_um": part["displacement_um"][::step],
     }
     text = {
@@ -120,7 +121,7 @@ def _as_columns(lab: Lab, axis: int, part: dict[str, Any], said: np.ndarray) -> 
 
 
 def identify_stacks(lab: Lab) -> Path:
-    """The calibration of all three stacks from the lab's set of recordings."""
+    """Identify all three stacks from the lab's set of recordings and return the calibration file."""
     fits: list[Any] = []
     for axis in range(3):
         recordings: list[Recording] = []
@@ -137,7 +138,7 @@ def identify_stacks(lab: Lab) -> Path:
 
 
 def compare_manipulator(lab: Lab) -> Comparison:
-    """The tip against the firmware's geometry at a grid of voltages."""
+    """Compare the tip with the firmware's geometry at a grid of voltages."""
     a = load_plan(lab.bench).stages.actuation
     data = load_scan(_scan(lab))
     rest, at, zero = np.array(a.rest_heights_m), np.empty((len(data["tip_um"]), 3)), np.empty(3)
@@ -157,21 +158,21 @@ def _scan(lab: Lab) -> Path:
 
 
 def identify_geometry(lab: Lab) -> Path:
-    """The calibration of the manipulator from a scan of its workspace."""
+    """Identify the manipulator from a scan of its workspace and return the calibration file."""
     file = lab.folder / "manipulator.toml"
     file.write_text(manipulator_calibration(identify_manipulator(load_scan(_scan(lab))), "manipulator"))
     return file
 
 
 def compare_sensors(lab: Lab) -> Comparison:
-    """The accelerometer axes against the firmware's calibration at resting attitudes."""
+    """Compare the accelerometer axes with the firmware's calibration at resting attitudes."""
     sensing = load_plan(lab.bench).stages.sensing
     data = load_tumble(_tumble(lab))
     gravity = lab.config.environment.gravity_m_s2
     force = data["attitude"].transpose(0, 2, 1) @ np.array([0.0, 0.0, 1.0])
     ratio = data["analog_V"][:, 6] * sensing.supply_divider / sensing.nominal_supply_V
-    said = np.array(sensing.bias_V) + np.array(sensing.scale_V_per_g) * (force @ np.array(sensing.axes).T)
-    away = (data["analog_V"][:, :6] / ratio[:, None] - said) / np.array(sensing.scale_V_per_g)
+    modelled = np.array(sensing.bias_V) + np.array(sensing.scale_V_per_g) * (force @ np.array(sensing.axes).T)
+    away = (data["analog_V"][:, :6] / ratio[:, None] - modelled) / np.array(sensing.scale_V_per_g)
     return Comparison(gravity * float(np.sqrt(np.mean(away**2))), "m/s^2")
 
 
@@ -183,7 +184,7 @@ def _tumble(lab: Lab) -> Path:
 
 
 def identify_tumble(lab: Lab) -> Path:
-    """The calibration of the sensors from resting attitudes."""
+    """Identify the sensors from resting attitudes and return the calibration file."""
     found = identify_sensors(load_tumble(_tumble(lab)), quadratic=True, fit_drift=False)
     table = {"sensing": {**found.table, "gravity_m_s2": lab.config.environment.gravity_m_s2}}
     file = lab.folder / "sensors.toml"
@@ -196,4 +197,4 @@ PARTS = (
     Part("manipulator", compare_manipulator, identify_geometry),
     Part("sensors", compare_sensors, identify_tumble),
 )
-"""In the order in which they are healed: what moves the tip, then what measures it."""
+"""Parts in the order in which they are healed: first those that move the tip, then those that measure it."""
