@@ -24,8 +24,8 @@ from websockets.sync.client import connect
 
 from benchmarks.row import Row
 from firmware_py.scheduler.histogram import bucket_bounds_ns, bucket_of
-from tools.bench.started import started
 from tools.cli.bench_option import bench_path
+from tools.research.pictures import started
 
 SECONDS = 10.0
 NONE, ONE, TWELVE, STRANGERS = "no viewer", "one viewer", "twelve viewers", "twelve strangers"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 
+from tools.bench.guard import Access
 from tools.bench.viewer import Viewer
 
 HELLO = {"type": "hello", "token": "right"}
@@ -61,8 +61,8 @@ class Session:
 
 async def served(words: list[dict[str, Any]], leaving: str, grants: bool = True) -> list[str]:
     session, socket = Session(grants), Socket(words, leaving)
-    access = SimpleNamespace(open_reading=True, knows=lambda token: token == "right")
-    serving = asyncio.create_task(Viewer(cast(Any, socket), cast(Any, session), cast(Any, access)).serve())
+    access = Access("right", frozenset(), open_reading=True)
+    serving = asyncio.create_task(Viewer(cast(Any, socket), cast(Any, session), access).serve())
     await asyncio.wait_for(socket.all_said.wait(), 30)
     if leaving == "server ends":
         await asyncio.sleep(0)

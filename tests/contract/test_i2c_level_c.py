@@ -36,7 +36,7 @@ def device_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     runtime = tmp_path_factory.mktemp("run")
     world = provider(DESCRIPTION, clock=None, runtime_dir=runtime, hand_file=None, hand_scale=None)
     assert isinstance(world, ProcessWorld)
-    command = [sys.executable, "-m", "sim_devices.transports.i2c_fuse", world.endpoint("i2c0"), str(folder)]
+    command = [sys.executable, "-m", "tests.contract.i2c_fuse", world.endpoint("i2c0"), str(folder)]
     daemon = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert daemon.stdout is not None
     assert daemon.stderr is not None

@@ -7,19 +7,44 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tools.bench.started import started
+from hal.children import child_command, child_environment
 from tools.terminal import plain_console
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 SETTLE_MS = {"scope": 3000, "tremor": 3000}
 STEADY_S = 9.0
 """Time of the run at the first picture: the start-up has left every window by then."""
+
+
+@contextmanager
+def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start ``micron bench`` with ``options`` on a free port, and end it with the block. Yield its process and the address
+    that it printed, with the token."""
+    server = subprocess.Popen(
+        child_command("tools.cli.main", "bench", "--port", "0", *options),
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**child_environment(), "COLUMNS": "400"},  # the address in one line
+    )
+    try:
+        assert server.stderr is not None
+        address = next(word for line in server.stderr for word in line.split() if word.startswith("http"))
+        threading.Thread(target=server.stderr.read, daemon=True).start()
+        yield server, address
+    finally:
+        if server.poll() is None:
+            server.send_signal(signal.SIGTERM)
+            server.wait(60)
 
 
 def take(page: Any, folder: Path, views: tuple[str, ...]) -> None:

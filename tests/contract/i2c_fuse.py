@@ -1,6 +1,6 @@
 """An emulated I2C bus as a file that any process opens like ``/dev/i2c-1``: honest to the kernel's ioctl path.
 
-``python -m sim_devices.transports.i2c_fuse unix-i2c:///path/of.sock MOUNT_FOLDER`` mounts a file system with one file,
+``python -m tests.contract.i2c_fuse unix-i2c:///path/of.sock MOUNT_FOLDER`` mounts a file system with one file,
 ``i2c-1``, and serves it until it is unmounted or terminated. The kernel hands each ioctl(2) on that file to this
 process (FUSE protocol 7.31, spoken directly on /dev/fuse); since the I2C ioctls do not encode their sizes, the
 caller's structures are read and written with process_vm_readv/writev. Needs root and /dev/fuse.
