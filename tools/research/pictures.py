@@ -28,8 +28,8 @@ STEADY_S = 9.0
 
 @contextmanager
 def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start ``micron bench`` with ``options`` on a free port, and end it with the block. Yield its process and the address
-    that it printed, with the token."""
+    """Start ``micron bench`` with ``options`` on a free port, and end it with the block. Yield its process and
+    the address that it printed, with the token."""
     server = subprocess.Popen(
         child_command("tools.cli.main", "bench", "--port", "0", *options),
         stderr=subprocess.PIPE,
