@@ -223,13 +223,14 @@ def _weights(x: np.ndarray) -> Constants:
 
 
 def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequence[Case]) -> Constants:
-    """``c`` with the option that gets most cases exactly right; of equals the one in their middle (by logarithms)."""
+    """``c`` with the option that gets most cases exactly right; of equals the nearest to ``START`` (by logarithms): what
+    the cases say nothing about stays as it was."""
     tried = [replace(c, **{k: float(v) for k, v in o.items()}) for o in options]
     counts = [sum(case.right(t) for case in cases) for t in tried]
     top = [t for t, n in zip(tried, counts, strict=True) if n == max(counts)]
     at = np.log([[t.least_z, t.cut, t.cut_share] for t in top])
-    middle = np.median(at, axis=0)
-    return top[int(np.argmin(np.sum((at - middle) ** 2, axis=1)))]
+    prior = np.log([START.least_z, START.cut, START.cut_share])
+    return top[int(np.argmin(np.sum((at - prior) ** 2, axis=1)))]
 
 
 class StatedName(NamedTuple):
