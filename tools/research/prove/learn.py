@@ -223,8 +223,8 @@ def _weights(x: np.ndarray) -> Constants:
 
 
 def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequence[Case]) -> Constants:
-    """``c`` with the option that gets most cases exactly right; of equals the nearest to ``START`` (by logarithms): what
-    the cases say nothing about stays as it was."""
+    """Take the option that gets most cases exactly right; of equals the nearest to ``START`` (by logarithms): what the
+    cases say nothing about stays as it was."""
     tried = [replace(c, **{k: float(v) for k, v in o.items()}) for o in options]
     counts = [sum(case.right(t) for case in cases) for t in tried]
     top = [t for t, n in zip(tried, counts, strict=True) if n == max(counts)]
