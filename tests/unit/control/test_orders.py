@@ -7,15 +7,16 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import closing
-from types import SimpleNamespace
-from typing import Any, cast
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import HandOrders
-from firmware_py.control.stages import Stages
+from firmware_py.control.plan import load_plan
+from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.exit_codes import Exit, exit_code_of
 from firmware_py.live.link import MAX_ORDERS, LiveLink
 from firmware_py.live.memory import LiveMemory
@@ -23,10 +24,18 @@ from firmware_py.run.findings import CauseClass, Finding
 from firmware_py.run.orders import PageOrders
 from firmware_py.run.safety import State, Trip
 from firmware_py.scheduler.histogram import DurationHistogram
+from hal.bench import load_bench
 from hal.errors import BenchError, DeviceNotFound, HalTimeout, OpenFailed
+from tests.conftest import DEFAULT_BENCH
 from tests.unit.control.stand import MS, StandRun
 
 HOST_AHEAD_NS = 1_000_000_000_000
+
+
+@cache
+def default_stages() -> StageConfigs:
+    """The stages of the default bench."""
+    return load_plan(load_bench(DEFAULT_BENCH)).stages
 
 
 class Desk:
@@ -40,11 +49,9 @@ class Desk:
         self.clock, self.supervisor, self.incidents = self.run.clock, self.run.supervisor, self.run.incidents
         self.recorder, self.counts = self.run.recorder, self.run.counts
         self.manual = ManualDrive(0.0, 100.0, 50.0)
-        self.params = {"gain": 1.0}
-        stages = cast(
-            Stages,
-            SimpleNamespace(command_V=np.array([40.0, 50.0, 60.0]), actuation=SimpleNamespace(params=self.params)),
-        )
+        stages = Stages(default_stages())
+        stages.command_V[:] = 40.0, 50.0, 60.0
+        self.params = stages.actuation.params
         self.orders = PageOrders(self.run, HandOrders(self.manual, stages, self.run).obey, self.host_ns)
 
     def host_ns(self) -> int:
