@@ -131,9 +131,18 @@ def measure_piezo(
         raise LabError(f"{seconds:g} s: the lab closes after an hour (3600 s)")
     if not 0.0 < amplitude_V <= 50.0:
         raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
-    temperature_C = start_temperature_C(config)
-    read_hz = sample_rate_hz(profile)
     volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
+    what = f"{profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
+    return measure_volts(config, axis, volts, sample_rate_hz(profile), f"{profile}.{rate_hz:g}", what, twin)
+
+
+def measure_volts(
+    config: EmulationConfig, axis: int, volts: Array, read_hz: float, noise: str, what: str, twin: FileTwin | None
+) -> tuple[dict[str, Array], str]:
+    """Return the columns (n,) of a recording with the demands ``volts`` (n,) at ``read_hz``, and its
+    ``recording.toml``. ``noise`` names the stream of the interferometer's noise, ``what`` the demands in the title.
+    """
+    temperature_C = start_temperature_C(config)
     room_C = np.full(len(volts), temperature_C)
     if twin is not None:
         if twin.kind != "piezo_stack":
@@ -144,15 +153,14 @@ def measure_piezo(
         params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
         stroke, terminal_V = np.empty(len(volts)), np.empty(len(volts))
         drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), stroke, terminal_V)
-    hiss = stream(config.seed, f"lab.piezo.{axis}.{profile}.{rate_hz:g}").standard_normal(len(volts))
-    noise = INTERFEROMETER_RMS_UM * hiss
+    hiss = stream(config.seed, f"lab.piezo.{axis}.{noise}").standard_normal(len(volts))
     columns = {
         "command_V": volts,
-        "displacement_um": stroke * 1e6 + noise,
+        "displacement_um": stroke * 1e6 + INTERFEROMETER_RMS_UM * hiss,
         "temperature_C": room_C,
     }
     descriptor = f"""format = 1
-title = "piezo stack {axis} of unit {config.unit}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
+title = "piezo stack {axis} of unit {config.unit}, {what}"
 data = "data.npz"
 rate_hz = {read_hz}
 

@@ -57,6 +57,24 @@ def pivot_path(seconds: float, seed: int) -> Array:
     return nodes
 
 
+SHAKES_HZ = (3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 30.0, 38.0, 46.0)
+"""Frequencies of the shaker, along x, y and z in turn."""
+SHAKE_M_S2 = 0.5
+"""Amplitude of the acceleration at each of them."""
+
+
+def shake_path(seconds: float) -> Array:
+    """(n, 18) nodes of a shaker: sinusoids along the world's axes, each with the same acceleration."""
+    t = np.arange(1, round(seconds / NODE_S) + 1) * NODE_S
+    nodes = np.zeros((len(t), 18))
+    for k, hz in enumerate(SHAKES_HZ):
+        w, axis = 2.0 * np.pi * hz, k % 3
+        nodes[:, axis] -= SHAKE_M_S2 / w**2 * np.sin(w * t)
+        nodes[:, 6 + axis] -= SHAKE_M_S2 / w * np.cos(w * t)
+        nodes[:, 12 + axis] += SHAKE_M_S2 * np.sin(w * t)
+    return nodes
+
+
 @kernel
 def sense_at(p, s, node, noise, slow):
     """Compute a millisecond of the sensors from hand node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
@@ -83,16 +101,22 @@ def record(plant, state, nodes, noise, slow, first, held, analog, magnet):
 
 
 def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[dict[str, Array], str]:
-    """Return columns (n,) at 1 kHz and their descriptor. ``kind`` is ``rest`` or ``pivot``."""
+    """Return columns (n,) at 1 kHz and their descriptor. ``kind`` is ``rest``, ``pivot`` or ``shake``; the last has the
+    acceleration of the shaker as well.
+    """
     shortest = 10.0 if kind == "pivot" else 1.0
     if not shortest <= seconds <= 3600.0:
         raise BenchError(f"{seconds:g} s: give {shortest:g} to 3600 s")
     n = round(seconds / NODE_S)
-    nodes = pivot_path(seconds, config.seed) if kind == "pivot" else np.zeros((n, 18))
+    nodes = np.zeros((n, 18))
+    if kind == "pivot":
+        nodes = pivot_path(seconds, config.seed)
+    elif kind == "shake":
+        nodes = shake_path(seconds)
     plant, state = plant_arrays(config, build_unit(config, config.unit), holding_frame(config.hand))
     # one step per millisecond: the RC filters are exact for input that is linear in between
     plant[0]["accelerometer"] = sensor_unit(config.sensors, config.instrument, config.unit, NODE_S).accelerometers
-    begin(plant, state, np.zeros(18), np.zeros(6), np.zeros(TRUTH_COLUMNS))
+    begin(plant, state, nodes[0] if kind == "shake" else np.zeros(18), np.zeros(6), np.zeros(TRUTH_COLUMNS))
     rng = stream(config.seed, f"lab.{kind}")
     analog, magnet, held = np.empty((n, 8)), np.empty((n, 3)), np.zeros(3)
     for first in range(0, n, BLOCK):
@@ -101,7 +125,11 @@ def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[
         noise, slow = rng.standard_normal((count, NOISES)), rng.standard_normal((count, SLOW_NOISES))
         record(plant, state, nodes[part], noise, slow, first, held, analog[part], magnet[part])
     columns = {"analog_V": analog, "magnetometer_V": magnet}
-    what = "swung about its tip, which stands in a dimple" if kind == "pivot" else "at rest on a table"
+    if kind == "shake":
+        columns["acceleration_m_s2"] = nodes[:, 12:15]
+    what = {"pivot": "swung about its tip, which stands in a dimple", "shake": "on a shaker"}.get(
+        kind, "at rest on a table"
+    )
     descriptor = f"""format = 1
 title = "unit {config.unit} {what}"
 data = "data.npz"

@@ -42,6 +42,7 @@ def plan(
     ] = None,
     amplitude: Annotated[float | None, typer.Option(help="Largest distance from the centre, channel's unit.")] = None,
     centre: Annotated[float | None, typer.Option(help="Centre of the input, channel's unit.")] = None,
+    rms: Annotated[float | None, typer.Option(help="Largest rms about the centre, channel's unit.")] = None,
     rate: Annotated[float | None, typer.Option(help="Fastest change, channel's unit per second.")] = None,
     band: Annotated[str | None, typer.Option(metavar="LOW:HIGH", help="Frequencies, Hz.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Length of the recording.")] = None,
@@ -81,7 +82,7 @@ def plan(
         from tools.mismatch.plan.limits import Wish, bench_limits, parse_band
 
         limits = None if bench is None else bench_limits(load_bench(bench_path(bench)))
-        wish = Wish(amplitude, centre, rate, parse_band(band), duration)
+        wish = Wish(amplitude, centre, rate, parse_band(band), duration, rms)
         asked = planning.Asked(wish, tuple(inputs or ()), noise, None, size, evaluations, seed, limits)
         say = console() if json_file == "-" else data_console()
         if report is None:

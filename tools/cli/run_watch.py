@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from tools.mismatch.watch.frame import World
     from tools.mismatch.watch.live import Settings, Watching
 
-REFERENCE_S = 60.0
+REFERENCE_S = 300.0
+"""Default length of the reference: a wander that it does not show raises alarms."""
 SHORTEST_S, LONGEST_S = 15.0, 3600.0
 
 WatchOption = Annotated[

@@ -12,6 +12,7 @@ from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from sim_devices.config import emulation_config
 from tools.bench.bench_copy import with_calibration
 from tools.errors import InputError
+from tools.heal.experiments import StackTwin, twin_of_stack
 from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
 from tools.heal.parts import PARTS, Comparison, Lab, Part
 from tools.output import write_text_atomic
@@ -33,7 +34,8 @@ Say = Callable[[str], None]
 class Step:
     """Records the treatment of a part: misfit, effects that the engine named, and if and why its remedy was kept.
 
-    ``no_remedy`` lists the named effects that the firmware cannot compensate.
+    ``no_remedy`` lists the named effects that the firmware cannot compensate, ``split`` those for which an experiment
+    was planned and played. ``twin`` is the corrected twin of the stack that differed most.
     """
 
     part: str
@@ -44,6 +46,8 @@ class Step:
     kept: bool
     why: str
     after: Mapping[str, float]
+    twin: str | None = None
+    split: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,10 @@ def heal(
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
         effects = _named(compared, jobs) if name_effects else ()
+        twin: StackTwin | None = None
+        if name_effects and compared.axis is not None:
+            say(f"{part.name}: the twin of stack {compared.axis + 1}")
+            twin = twin_of_stack(lab, compared.axis, jobs)
         say(f"{part.name}: identifying")
         try:
             file = out / f"{part.name}.toml"
@@ -100,10 +108,10 @@ def heal(
             candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
             after = tip_error(candidate, seconds, seeds)
         except InputError as error:
-            steps.append(_step(part, compared, effects, False, str(error), now))
+            steps.append(_step(part, compared, effects, False, str(error), now, twin))
             continue
         kept, why = is_better(now, after)
-        steps.append(_step(part, compared, effects, kept, why, after))
+        steps.append(_step(part, compared, effects, kept, why, after, twin))
         if kept:
             bench, now = candidate, after
         else:
@@ -152,9 +160,14 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
     return tuple(p.name for p in report.physics)
 
 
-def _step(part: Part, compared: Comparison, effects: tuple[str, ...], kept: bool, why: str, after: TipError) -> Step:
+def _step(
+    part: Part, compared: Comparison, effects: tuple[str, ...], kept: bool, why: str, after: TipError,
+    twin: StackTwin | None,
+) -> Step:  # fmt: skip
     none = tuple(e for e in effects if e not in STACK_EFFECTS)
-    return Step(part.name, compared.rms, compared.unit, effects, none, kept, why, after.mean())
+    file = str(twin.file) if twin is not None and twin.file is not None else None
+    split = twin.split if twin is not None else ()
+    return Step(part.name, compared.rms, compared.unit, effects, none, kept, why, after.mean(), file, split)
 
 
 def lines(healed: Healed) -> list[str]:
@@ -164,6 +177,10 @@ def lines(healed: Healed) -> list[str]:
         named = f"; the engine names {', '.join(s.effects).replace('_', ' ')}" if s.effects else ""
         out.append(f"{s.part}: differs from what the firmware believes by {s.difference:.3g} {s.unit} rms{named}.")
         out += [f"  {e.replace('_', ' ')}: the firmware has no remedy." for e in s.no_remedy]
+        if s.split:
+            out.append(f"  planned and recorded: what splits {', '.join(s.split).replace('_', ' ')}.")
+        if s.twin is not None:
+            out.append(f"  corrected twin of the stack: {s.twin}")
         out.append(f"  {'kept' if s.kept else 'reverted'}: {s.why}.")
     out.append(f"tip error, um rms, mean of {len(healed.seeds)} runs of {healed.seconds:g} s")
     out += [f"  {b:12} {healed.before[b]:8.3f} -> {healed.after[b]:8.3f}" for b in (*BANDS, WHOLE)]

@@ -18,6 +18,7 @@ from firmware_py.actuation.manipulator import star_tip
 from firmware_py.control.plan import load_plan
 from hal.bench import BenchFile
 from sim_devices.config import EmulationConfig
+from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.lab import (
     CALIBRATION_SET,
     INTERFEROMETER_RMS_UM,
@@ -26,12 +27,14 @@ from sim_devices.plant.lab import (
     measure_tumble,
     write_recording,
 )
+from sim_devices.plant.lab_motion import NODE_S, SHAKES_HZ, measure_motion
 from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.streams import stream
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.manipulator import identify_manipulator, load_scan, manipulator_calibration
 from tools.calibrate.piezo import identify_stack, piezo_calibration
 from tools.calibrate.piezo_prediction import simulate as predict_stroke
+from tools.calibrate.sensor_lag import SensorLag, identify_lag, lag_at, unfiltered_V
 from tools.calibrate.tumble import identify as identify_sensors
 from tools.calibrate.tumble import load_tumble
 from tools.mismatch.recording import Recording
@@ -43,6 +46,8 @@ CHECK_S, CHECK_HZ = 8.0, 250.0
 PROFILES = (("loops", 10.0), ("sawtooth", 2.0))
 """Inputs of the comparison: minor loops about every level, then one speed between those of the calibration."""
 POSITIONS, POSITION_S = 100, 5.0
+SHAKE_S = 20.0
+TREMOR_HZ = 10.0
 GRID = 5
 
 
@@ -59,12 +64,14 @@ class Lab:
 class Comparison:
     """Holds the ``rms`` of measured less modelled values, in ``unit``.
 
-    ``recording`` is for the engine; the modelled course is its simulated column.
+    ``recording`` is for the engine; the modelled course is its simulated column. ``axis`` is the stack
+    that differs most.
     """
 
     rms: float
     unit: str
     recording: Recording | None = None
+    axis: int | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,7 @@ def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: 
 
 def compare_stacks(lab: Lab) -> Comparison:
     """Compare each stack with the firmware's model of it, about the mean of both, and return the worst."""
-    worst: tuple[float, Recording] | None = None
+    worst: tuple[float, Recording, int] | None = None
     for axis, believed in enumerate(_stack_configs(lab.bench)):
         parts = [_measured_stack(lab, axis, p, hz, CHECK_S, AMPLITUDE_V) for p, hz in PROFILES]
         predicted = [predict_stroke(believed, p["command_V"]) for p in parts]
@@ -95,9 +102,9 @@ def compare_stacks(lab: Lab) -> Comparison:
             away = part["displacement_um"] - modelled
             rms = float(np.std(away))
             if worst is None or rms > worst[0]:
-                worst = (rms, _as_columns(lab, axis, part, modelled))
+                worst = (rms, _as_columns(lab, axis, part, modelled), axis)
     assert worst is not None
-    return Comparison(worst[0], "um", worst[1])
+    return Comparison(worst[0], "um", worst[1], worst[2])
 
 
 def _as_columns(lab: Lab, axis: int, part: dict[str, Any], modelled: np.ndarray) -> Recording:
@@ -192,9 +199,43 @@ def identify_tumble(lab: Lab) -> Path:
     return file
 
 
+def compare_lag(lab: Lab) -> Comparison:
+    """The delay of the accelerometers at 10 Hz against that of the filter in which the firmware believes."""
+    sensing = load_plan(lab.bench).stages.sensing
+    there = lag_at(1.0 / sensing.cutoff_rad_s, 0.0, TREMOR_HZ)
+    found = _lag(lab)
+    here = lag_at(found.filter_s, found.delay_s, TREMOR_HZ)
+    return Comparison(1e3 * abs(float(np.angle(here / there))) / (2.0 * np.pi * TREMOR_HZ), "ms at 10 Hz")
+
+
+def _lag(lab: Lab) -> SensorLag:
+    columns, text = measure_motion(lab.config, "shake", SHAKE_S)
+    write_recording(lab.folder / "shake", columns, text)
+    gravity = lab.config.environment.gravity_m_s2
+    attitude = holding_frame(lab.config.hand)
+    force_g = (columns["acceleration_m_s2"] + np.array([0.0, 0.0, gravity])) @ attitude / gravity
+    said = unfiltered_V(load_plan(lab.bench).stages.sensing, force_g)
+    settled = slice(round(1.0 / NODE_S), None)
+    return identify_lag(said[settled], columns["analog_V"][settled, :6], NODE_S, np.array(SHAKES_HZ))
+
+
+def identify_timing(lab: Lab) -> Path:
+    """The calibration of the accelerometers' filter and of what delays them behind it, from a shaker."""
+    found = _lag(lab)
+    stages = load_plan(lab.bench).stages
+    table = {
+        "sensing": {"filter_farad": found.filter_s / stages.sensing.filter_ohm},
+        "tremor": {"loop_delay_s": stages.tremor.loop_delay_s + found.delay_s},
+    }
+    file = lab.folder / "timing.toml"
+    file.write_text(calibration_toml("filter and delay of the sensors", "micron mismatch heal", table))
+    return file
+
+
 PARTS = (
     Part("stacks", compare_stacks, identify_stacks),
     Part("manipulator", compare_manipulator, identify_geometry),
     Part("sensors", compare_sensors, identify_tumble),
+    Part("timing", compare_lag, identify_timing),
 )
 """Parts in the order in which they are healed: first those that move the tip, then those that measure it."""

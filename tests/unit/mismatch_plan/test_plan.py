@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Stage
 from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
@@ -17,10 +18,12 @@ from tools.mismatch.plan.limits import Wish, parse_band, settle_limits
 from tools.mismatch.plan.models import Rival, distance, log_ratio
 from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect
 from tools.mismatch.plan.separable import separable
-from tools.mismatch.plan.situation import Situation, noisy, situation, with_outputs
+from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, situation, with_outputs
 from tools.mismatch.plan.waveforms import FAMILIES, SIZE, draw, mean_square, random_multisine
 from tools.mismatch.plan.write import write_plan
 from tools.mismatch.recording import Array
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_start import prepare
 
 RATE_HZ, N, TAU_S, NOISE_UM = 500.0, 1500, 0.004, 0.02
 
@@ -77,8 +80,13 @@ def report() -> dict[str, Any]:
 
 def lag_and_delay(where: Situation) -> tuple[Rival, Rival]:
     output = ("displacement",)
-    lag = Placed(EFFECTS["first_order_lag"], "output", "displacement", "sensor", output)
-    delay = Placed(EFFECTS["dead_time"], "output", "displacement", "acquisition", output)
+    problem = problem_of(where.template, SIGMA)
+    rest, at = Model(problem.twin), problem.twin.start(where.template)
+
+    def placed(name: str, stage: Stage) -> Placed:
+        return prepare(rest, problem.fit_view, at, Placed(EFFECTS[name], "output", "displacement", stage, output))
+
+    lag, delay = placed("first_order_lag", "sensor"), placed("dead_time", "acquisition")
     base = [0.0, 0.12]
     return (
         Rival("first_order_lag", (lag,), np.array([*base, TAU_S])),
@@ -122,9 +130,23 @@ def test_distance_is_the_expected_log_likelihood_ratio(recorded: Path):
     assert abs(np.mean(ratios) - d**2 / 2) < 3 * d / np.sqrt(len(ratios)) + 1.0
 
 
+def test_a_model_that_begins_at_rest_is_at_no_distance_from_itself_on_an_input_that_repeats(tmp_path: Path):
+    file = tmp_path / "recording.toml"
+    file.write_text(
+        'format = 1\nrate_hz = 500.0\n[twin]\nkind = "state_space"\n[twin.parameters]\n'
+        "A = [[0.0, 1.0], [-900.0, -30.0]]\nB = [[0.0], [900.0]]\nC = [[1.0, 0.0]]\n"
+        '[[channels]]\ncolumn = "u"\nrole = "input"\nsignal = "drive"\nunit = "V"\n'
+        '[[channels]]\ncolumn = "y"\nrole = "output"\nsignal = "response"\nunit = "V"\n'
+    )
+    where = situation(file)
+    levels = np.repeat(np.array([5.0, -3.0, 2.0, -4.0]), 50)
+    course = where.course({"drive": np.tile(levels, 5)})
+    twin = problem_of(course, {"response": 1e-3}).twin
+    own = Rival("none", (), twin.start(course))
+    assert distance(course, own, own, {"response": 1e-3}, thorough=True) < 0.1
+
+
 def _outputs(course: Any, rival: Rival) -> dict[str, Array]:
-    from tools.mismatch.plan.situation import simulated
-    from tools.mismatch.simulate import Model
     from tools.mismatch.twins.make import make
 
     return simulated(course, Model(make(course), rival.placed), rival.theta)

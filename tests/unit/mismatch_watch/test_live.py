@@ -81,7 +81,7 @@ def test_a_good_twin_stays_and_costs_less_than_a_twentieth_of_a_processor(twin: 
     found = watch(twin, rows)
     assert found.phase == "watching"
     assert not found.alarms
-    assert set(found.reference_rms) == {f"volts_{i}" for i in range(8)}
+    assert set(found.reference_rms) == {f"volts_{i}" for i in range(6)}
     assert found.cpu_share < 0.05
     assert "reality does not leave the twin" in lines(found)[-1]
 

@@ -27,11 +27,11 @@ def twin(tmp_path: Path) -> Path:
     [
         (["--watch-reference", 20], "--watch-reference belongs to --watch"),
         (["--false-alarms-per-hour", 1], "--false-alarms-per-hour belongs to --watch"),
-        (["--watch", "TWIN"], "the first 60 s are the reference of --watch"),
+        (["--watch", "TWIN"], "the first 300 s are the reference of --watch"),
         (["--watch", "TWIN", "--seconds", 30, "--watch-reference", 5], "must be 15 to 3600 s"),
-        (["--watch", "TWIN", "--seconds", 90, "--false-alarms-per-hour", 0], "must be 1e-06 to 60"),
-        (["--watch", "none.toml", "--seconds", 90], "none.toml"),
-        (["--watch", "TWIN", "--seconds", 90, "--bench", "endoscope"], "--watch belongs to the instrument"),
+        (["--watch", "TWIN", "--seconds", 390, "--false-alarms-per-hour", 0], "must be 1e-06 to 60"),
+        (["--watch", "none.toml", "--seconds", 390], "none.toml"),
+        (["--watch", "TWIN", "--seconds", 390, "--bench", "endoscope"], "--watch belongs to the instrument"),
     ],
 )
 def test_bad_input_of_run(twin: Path, words: list[object], said: str):

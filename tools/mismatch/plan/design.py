@@ -1,4 +1,4 @@
-"""The input that best separates rival models: maximise the least distance between any two over families of waveforms.
+"""The input that best separates rival models: maximise the least separation of any two over families of waveforms.
 
 The criterion is expensive and has many optima, so the search is plain: described inputs and random points of every
 family on a thinned budget, then a (1 + 1) evolution strategy with the one-fifth rule (Rechenberg 1973) from the best.
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.mismatch.plan.limits import Limits
-from tools.mismatch.plan.models import Rival, smallest_distance
+from tools.mismatch.plan.models import Rival, separation
 from tools.mismatch.plan.situation import Situation
 from tools.mismatch.plan.waveforms import FAMILIES, LIBRARY, SIZE, draw, mean_square, random_multisine
 from tools.mismatch.recording import Array
@@ -22,17 +22,17 @@ Progress = Callable[[str, int, int], None]
 
 RANDOM_PER_FAMILY = 3
 REFINED = 2
-FINALISTS = 3
+FINALISTS = 4
 QUICK, FULL = 4, 25
 """Iterations of the rival's re-fit while candidates are compared, and for the figures that are printed."""
-COMPARED = 9
-"""Random multisines of equal energy whose median distance is printed beside the plan."""
+COMPARED = 5
+"""Random multisines of equal energy whose median separation is printed beside the plan."""
 ENERGIES_SEED = 77
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned input: ``waves[signal]`` (n,), the least distance of any two rivals in standard deviations, and that of
+    """A planned input: ``waves[signal]`` (n,), the least separation of any two rivals in standard deviations, that of
     random multisines of equal energy (median). ``description`` names the family.
     """
 
@@ -81,7 +81,7 @@ def design(
         done += 1
         if progress is not None:
             progress("inputs", done, evaluations)
-        return smallest_distance(where.course(waves(family, z)), rivals, sigma, QUICK, floor)
+        return separation(where.course(waves(family, z)), rivals, sigma, QUICK, floor)
 
     points: list[_Point] = []
     for name, (family, z) in LIBRARY.items():
@@ -106,7 +106,7 @@ def design(
             else:
                 step = max(step * 1.5**-0.25, 0.01)
         ends.append(now)
-    # a re-fit that was cut short makes an input look better than it is: the finalists are re-fitted to the end
+    # a search that was cut short makes an input look better than it is: the finalists are followed to the end
     judged = [(pair_distances(where, rivals, waves(p.family, p.z), sigma), p) for p in ends]
     pairs, best = max(judged, key=lambda found: min(found[0].values()))
     chosen = waves(best.family, best.z)
@@ -134,10 +134,10 @@ def _unlike(points: Sequence[_Point], count: int) -> list[_Point]:
 def pair_distances(
     where: Situation, rivals: Sequence[Rival], waves: Mapping[str, Array], sigma: Mapping[str, float]
 ) -> dict[str, float]:
-    """The least distance of each unordered pair, by "one / other"."""
+    """The separation of each unordered pair, by "one / other"."""
     course = where.course(waves)
     return {
-        f"{a.name} / {b.name}": smallest_distance(course, (a, b), sigma, FULL)
+        f"{a.name} / {b.name}": separation(course, (a, b), sigma, FULL, thorough=True)
         for i, a in enumerate(rivals)
         for b in rivals[i + 1 :]
     }
@@ -158,10 +158,10 @@ def random_separation(
     sigma: Mapping[str, float],
     seed: int,
 ) -> float:
-    """The median least distance on random multisines of equal energy."""
+    """The median separation on random multisines of equal energy."""
     rng = np.random.default_rng([seed, ENERGIES_SEED])
     found = [
-        smallest_distance(where.course(random_inputs(waves, limits, where.dt, rng)), rivals, sigma, FULL)
+        separation(where.course(random_inputs(waves, limits, where.dt, rng)), rivals, sigma, FULL, thorough=True)
         for _ in range(COMPARED)
     ]
     return float(np.median(found))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,8 @@ BAND_SHARE = 0.1
 @dataclass(frozen=True)
 class Limits:
     """The input stays within ``centre`` +- ``amplitude``, moves by at most ``rate_per_s`` and lasts ``duration_s``;
-    ``band_hz`` bounds the frequencies of sinusoids and the inverse of the shortest hold.
+    ``band_hz`` bounds the frequencies of sinusoids and the inverse of the shortest hold. ``rms`` bounds its energy: the
+    rms about the centre.
     """
 
     unit: str
@@ -31,6 +33,7 @@ class Limits:
     rate_per_s: float
     band_hz: tuple[float, float]
     duration_s: float
+    rms: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,12 @@ class Wish:
     rate_per_s: float | None = None
     band_hz: tuple[float, float] | None = None
     duration_s: float | None = None
+    rms: float | None = None
+
+
+def limits_json(limits: Limits) -> dict[str, Any]:
+    """JSON values; an energy without a bound is null."""
+    return {**asdict(limits), "rms": limits.rms if np.isfinite(limits.rms) else None}
 
 
 def parse_band(text: str | None) -> tuple[float, float] | None:
@@ -69,6 +78,7 @@ def settle_limits(
         ("--amplitude", wish.amplitude),
         ("--rate", wish.rate_per_s),
         ("--duration", wish.duration_s),
+        ("--rms", wish.rms),
     ):
         if value is not None and not 0.0 < value < 1e9:
             raise InputError(f"{option} {value:g}: must be a positive number")
@@ -98,7 +108,8 @@ def settle_limits(
         raise InputError(f"--band {band[0]:g}:{band[1]:g}: {duration:g} s hold no half period of {band[0]:g} Hz")
     if rate is None:
         rate = 2.0 * np.pi * band[1] * amplitude
-    return Limits(unit, 0.0 if centre is None else centre, amplitude, float(rate), band, duration)
+    rms = np.inf if wish.rms is None else wish.rms
+    return Limits(unit, 0.0 if centre is None else centre, amplitude, float(rate), band, duration, rms)
 
 
 def bench_limits(file: BenchFile) -> dict[str, float]:

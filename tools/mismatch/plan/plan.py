@@ -13,7 +13,7 @@ from tools.errors import InputError
 from tools.mismatch import units
 from tools.mismatch.plan import structure
 from tools.mismatch.plan.design import Plan, Progress, design
-from tools.mismatch.plan.limits import Limits, Wish, settle_limits
+from tools.mismatch.plan.limits import Limits, Wish, limits_json, settle_limits
 from tools.mismatch.plan.models import Rival
 from tools.mismatch.plan.rivals import groups_of, noise_of, rivals_of
 from tools.mismatch.plan.separable import Separable, channel_gains, separable
@@ -55,7 +55,7 @@ class Prospect:
         return {
             "format": 1,
             "twin": str(self.where.path),
-            "limits": {s: asdict(box) for s, box in self.limits.items()},
+            "limits": {s: limits_json(box) for s, box in self.limits.items()},
             "noise_rms": {o: {"value": v, "unit": unit[o]} for o, v in self.sigma.items()},
             **asdict(self.found),
             "channels": {s: list(names) for s, names in self.channels.items()},
@@ -85,7 +85,7 @@ class Designed:
             "group": list(self.group),
             "rivals": [r.name for r in self.rivals],
             "input": p.description,
-            "limits": {s: asdict(box) for s, box in p.limits.items()},
+            "limits": {s: limits_json(box) for s, box in p.limits.items()},
             "separation_sd": p.separation,
             "random_multisine_sd": p.random_separation,
             "pairs_sd": dict(p.pairs),
@@ -110,7 +110,7 @@ def limits_of(where: Situation, asked: Asked) -> dict[str, Limits]:
     if unknown:
         raise InputError(f"--input {unknown[0]}: {where.path} has no such input; it has {', '.join(rec.inputs)}")
     signals = asked.inputs or tuple(rec.inputs)
-    if len({rec.unit[s] for s in signals}) > 1 and (asked.wish.amplitude or asked.wish.rate_per_s):
+    if len({rec.unit[s] for s in signals}) > 1 and (asked.wish.amplitude or asked.wish.rate_per_s or asked.wish.rms):
         raise InputError(f"{where.path}: its inputs have different units; name one with --input")
     out: dict[str, Limits] = {}
     for s in signals:
@@ -126,7 +126,8 @@ def _in_twin_units(wish: Wish, given: str, to: str) -> Wish:
         return None if v is None else units.convert_difference(v, given, to)
 
     centre = None if wish.centre is None else float(units.convert(np.array([wish.centre]), given, to)[0])
-    return replace(wish, amplitude=size(wish.amplitude), rate_per_s=size(wish.rate_per_s), centre=centre)
+    sizes = {"amplitude": size(wish.amplitude), "rate_per_s": size(wish.rate_per_s), "rms": size(wish.rms)}
+    return replace(wish, **sizes, centre=centre)
 
 
 def prospect(path: Path, asked: Asked) -> Prospect:

@@ -71,7 +71,11 @@ def rivals_of(
         # the effects of an earlier correction are base physics of this problem
         raise InputError(f"{where.path}: its twin was corrected before; plan from the recording of the first diagnosis")
     out: list[Rival] = []
-    first = fitted_rival(problem, group[0], model.placed, [theta])
+    rest = Model(problem.twin)
+    begin = rest.carry(model, theta, problem.recording)
+    # a report written by hand may leave the settings of effects out
+    placed = [p if p.settings else prepare(rest, problem.fit_view, begin, p) for p in model.placed]
+    first = fitted_rival(problem, group[0], placed, [theta])
     if first is not None:
         out.append(first)
     named = next(i for i, p in enumerate(model.placed) if p.effect.name == group[0])

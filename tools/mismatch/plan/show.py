@@ -58,7 +58,7 @@ def print_plan(d: Designed, say: Console) -> None:
         say.print(f"  {pair.replace('_', ' ')}: {sd:.1f} standard deviations", highlight=False)
     say.print(
         f"Expected separation {d.plan.separation:.1f} sd; random multisine of equal energy "
-        f"{d.plan.random_separation:.1f} sd (median of nine).",
+        f"{d.plan.random_separation:.1f} sd (median of five).",
         highlight=False,
         soft_wrap=True,
     )

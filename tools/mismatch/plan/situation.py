@@ -53,7 +53,11 @@ class Situation:
         return float(found)
 
     def course(self, inputs: Mapping[str, Array]) -> Recording:
-        """A recording with these inputs (n,), the others at rest, and outputs that still have to be simulated."""
+        """A recording with these inputs (n,), the others at rest, and outputs that still have to be simulated.
+
+        Until then they are a ramp: a record whose inputs and outputs repeat is taken to be in steady state, and this
+        one begins at rest.
+        """
         n = next(iter(inputs.values())).size
         old = self.template
         rest = {s: np.full(n, float(np.mean(x)) if self.recorded else 0.0) for s, x in old.inputs.items()}
@@ -61,7 +65,7 @@ class Situation:
             old,
             t=np.asarray(np.arange(n) * old.dt, np.float64),
             inputs={**rest, **inputs},
-            outputs={o: np.zeros(n) for o in old.outputs},
+            outputs={o: np.linspace(0.0, 1.0, n) for o in old.outputs},
             context={s: np.resize(x, n) for s, x in old.context.items()},
             segments=(),
             split=type(old.split)(),

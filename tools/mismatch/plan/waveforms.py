@@ -27,6 +27,9 @@ def _limited(shape: Array, limits: Limits, dt: float) -> Array:
     """``shape`` (largest magnitude 1) scaled to the amplitude; what is too fast is slowed down, not scaled away."""
     size = float(np.max(np.abs(shape)))
     x = shape * (limits.amplitude / size) if size > 0.0 else shape.copy()
+    rms = float(np.sqrt(np.mean(x**2)))
+    if rms > limits.rms:
+        x *= limits.rms / rms
     step = limits.rate_per_s * dt
     if np.max(np.abs(np.diff(x, prepend=0.0))) <= step:
         return x

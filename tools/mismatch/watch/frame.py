@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from firmware_py.frame import VOLTS
 from hal.bench import BenchFile
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import holding_frame
@@ -35,8 +36,11 @@ HOP_S = 1.0
 """Time of new rows that are simulated at once."""
 PLACEHOLDERS = 64
 """Samples of the made-up columns by which the twin is checked before anything runs."""
-STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("01234567"))]}
-"""Channels of a twin file that names none: quantity of the frame, unit, role, parts."""
+STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("012345"))]}
+"""Channels of a twin file that names none: quantity of the frame, unit, role, parts. Supply and temperature (6 and 7)
+are the room's, whose wander no twin knows."""
+SUPPLY = 6
+"""Input of the DAQ with a part of the accelerometers' supply, to which their readings are proportional."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +91,10 @@ class LiveTwin:
         """Take ``rows`` (n, columns of the frame) at ``t_s`` (n,). Return the residual (k, outputs) of the rows that
         are now due, in the order of the rows: measured less simulated.
         """
-        measured = self._signals(rows, self.template.outputs)
         if self._course is not None:
-            base = self._course.advance(t_s)
+            base = self._course.advance(t_s, rows)
             if self._is_bare:
+                measured = self._signals(rows, self.template.outputs)
                 return np.column_stack([measured[o] - base[o] for o in self.outputs])
             self._base = np.concatenate([self._base, np.column_stack([base[o] for o in self.outputs])])
         self._rows = np.concatenate([self._rows.reshape(-1, rows.shape[1]), rows])
@@ -128,7 +132,8 @@ class LiveTwin:
 class BenchCourse:
     """The noiseless emulated bench of an ``instrument`` twin, which runs on from call to call.
 
-    Commands are left out: they move the tip, which no channel of the frame measures.
+    Accelerometers get the measured supply in the place of the twin's. Commands are left out: they move the tip, which
+    no channel of the frame measures.
     """
 
     def __init__(self, config: EmulationConfig, own_hand: bool, world: World, unit: Mapping[str, str]) -> None:
@@ -141,12 +146,13 @@ class BenchCourse:
         self._unit = {o: (int(o.rpartition("_")[2]), u) for o, u in unit.items() if o.startswith("volts_")}
         self.start_s = 0.0
 
-    def advance(self, t_s: Array) -> dict[str, Array]:
-        """Outputs (n,) at ``t_s`` (n,), each not before the last one."""
+    def advance(self, t_s: Array, rows: Array) -> dict[str, Array]:
+        """Outputs (n,) at ``t_s`` (n,), each not before the last one, beside ``rows`` of the frame."""
         volts = np.empty((t_s.size, 8))
         for k, t_ns in enumerate(np.round((t_s + self.start_s) * 1e9).astype(np.int64).tolist()):
             self._instrument.advance_to(t_ns)
             volts[k] = self._instrument.analog_V
+        volts[:, :SUPPLY] *= (rows[:, VOLTS + SUPPLY] / volts[:, SUPPLY])[:, None]
         return {o: units.convert(volts[:, i], "V", u) for o, (i, u) in self._unit.items()}
 
 

@@ -23,8 +23,6 @@ from tools.mismatch.watch.detector import Alarm, State, begin, follow, interrupt
 from tools.mismatch.watch.frame import LiveTwin
 from tools.mismatch.watch.reference import Reference, learn
 
-REFERENCE_S = 60.0
-"""First part of a run in which the twin is good, unless told otherwise."""
 SHOWN_S = 1.0
 """Time over which the rms that is shown is taken."""
 MOST_ALARMS = 200

@@ -23,7 +23,7 @@ from tools.research.prove.harness import read_rows
 CHANGES: dict[str, str] = {
     "none": "",
     "stack hysteresis": "[emulation.stack]\nslip_sum = 0.62",
-    "amplifier gain 4 % up": "[emulation.amplifier]\ngain = 20.8",
+    "gain of amplifier and stack 8 % up": "[emulation.stack]\nstroke_um_at_100_V = 16.2",
     "accelerometers turned by a degree": "[emulation.sensors]\nmisalignment_deg = 1.5",
     "filter of the sensors slower": "[emulation.sensors]\nrc_farad = 0.43e-6",
     "manipulator turned in its mount": "[emulation.manipulator]\nmount_spread_deg = 4.0",
@@ -49,7 +49,10 @@ def run_one(name: str, folder: Path, seconds: float) -> dict[str, Any]:
     found = heal(path, folder, seconds=seconds, runs=8, say=lambda text: None)
     files = {"before": path, "after": Path(found.bench or path), "known": bench_file("micron")}
     row = {k: tip_error(load_bench(f), seconds, JUDGED).mean() for k, f in files.items()}
-    steps = [{"part": s.part, "effects": s.effects, "kept": s.kept, "why": s.why} for s in found.steps]
+    steps = [
+        {k: getattr(s, k) for k in ("part", "difference", "unit", "effects", "split", "kept", "why", "after")}
+        for s in found.steps
+    ]
     return {"change": name, **row, "steps": steps, "cpu_s": round(time.process_time() - began, 1)}
 
 

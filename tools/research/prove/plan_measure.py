@@ -2,10 +2,17 @@
 
 ``python -m tools.research.prove.plan_measure --keep FOLDER --groups 100 --seed 1 --minutes 8`` goes on where it ended.
 A group is drawn: a twin, an effect at a drawn place, size and parameters, and a slow first recording on which a rival
-of another name leaves at most 1.05 times the residual. The plan knows the two fits of that recording and not the truth.
-Both are then fitted to one planned and one random recording of the true system. A group is split when the log
-likelihood ratio favours the truth by ``ENOUGH``. The truth has the form of the vocabulary: a measure of plans, not of
-the vocabulary.
+of another name leaves at most 1.05 times the residual and which does not split the group, although some input would.
+The plan knows the two fits of that recording and not the truth. Both are then fitted to one planned and one random
+recording of the true system. A group is split when the log likelihood ratio favours the truth by ``ENOUGH``. The truth
+has the form of the vocabulary: a measure of plans, not of the vocabulary.
+
+With much energy every input splits every group. All inputs therefore have the same energy while the plan is designed
+(``RMS``), and the energy of a group is the least at which its plan is predicted to split nine recordings of ten: the
+planned waveform is made smaller until the prediction just holds, and the random multisine gets that energy. Where the
+plan says that it will not split a group with all that the limits allow, both inputs get that. Seeds 0, 26 and 27 were
+looked at while this was made; at seed 27 the first version, which gave both inputs all that the limits allow, split 27
+of 34 as planned and 32 at random.
 """
 
 from __future__ import annotations
@@ -14,7 +21,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,12 +29,13 @@ from typing import Any
 import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
-from tools.mismatch.plan.design import design, random_inputs
+from tools.mismatch.plan.design import FULL, design, random_inputs
 from tools.mismatch.plan.limits import Wish, settle_limits
-from tools.mismatch.plan.models import Rival, log_ratio, refit, squares
+from tools.mismatch.plan.models import Rival, distance, log_ratio, refit, squares
 from tools.mismatch.plan.responses import ground
 from tools.mismatch.plan.rivals import best_rival
 from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, with_outputs
+from tools.mismatch.plan.waveforms import LIBRARY, SIZE, draw
 from tools.mismatch.recording import Array, Recording
 from tools.mismatch.recording_load import from_table
 from tools.mismatch.simulate import Model
@@ -44,9 +52,17 @@ SAME = 1.05
 GOALS = (0.8, 0.4)
 """Share that a plan should split at least, and a random multisine of equal energy at most."""
 RATE_HZ, SAMPLES = 500.0, 2000
+RELIABLE = 1.2816
+"""Standard deviations of the log likelihood ratio (its variance is the squared distance) that the prediction is below
+its mean: nine recordings of ten exceed it."""
+HALVINGS, BISECTIONS = 12, 4
 REACH = 20.0
 """Largest input of the first recording, and of the plan: the default of the command."""
-DRAWS = 60
+RMS = REACH / 3.0
+"""Rms of every input while the plan is designed: one that the multisines reach within ``REACH``, too."""
+WISH = Wish(amplitude=REACH, centre=0.0, duration_s=SAMPLES / RATE_HZ, rms=RMS)
+"""Limits of the plan."""
+DRAWS = 100
 """Systems that are drawn at most until one has an equivalent rival."""
 PAIRS = (
     ("first_order_lag", "dead_time"), ("first_order_lag", "resonance"), ("dead_time", "resonance"),
@@ -161,7 +177,22 @@ def _try_group(rng: np.random.Generator, twin: str, name: str, other: str) -> Gr
     left = [_rms(recorded, r, sigma) for r in fits if r is not None]
     if left[1] > SAME * left[0] or left[0] > SAME or fits[0].name == fits[1].name:
         return None
-    return Group(twin, where, Rival(name, (placed,), theta), (fits[0], fits[1]), sigma, severity)
+    if log_ratio(recorded, fits[0], fits[1], sigma) >= ENOUGH:
+        return None  # told apart by the first recording already
+    group = Group(twin, where, Rival(name, (placed,), theta), (fits[0], fits[1]), sigma, severity)
+    return group if is_splittable(group, rng) else None
+
+
+def is_splittable(group: Group, rng: np.random.Generator) -> bool:
+    """Return whether any of some strong inputs within the limits, none of them planned, would split the true system
+    from the rival: no plan can split what is alike on every input.
+    """
+    signal = next(iter(group.where.template.inputs))
+    box = settle_limits(replace(WISH, rms=None), group.where.template.unit[signal], 1 / RATE_HZ, None, "", None)
+    inputs = [draw(family, np.asarray(z), box, 1 / RATE_HZ) for family, z in LIBRARY.values()]
+    inputs += [draw("multisine", rng.random(SIZE["multisine"]), box, 1 / RATE_HZ) for _ in range(2)]
+    pair = (group.truth, group.rivals[1])
+    return any(predicted(group.where.course({signal: u}), pair, group.sigma) >= ENOUGH for u in inputs)
 
 
 def _rms(recorded: Any, rival: Rival, sigma: dict[str, float]) -> float:
@@ -182,6 +213,38 @@ def thorough(recorded: Recording, rival: Rival, sigma: dict[str, float]) -> Riva
     return fresh
 
 
+def predicted(course: Recording, rivals: tuple[Rival, Rival], sigma: dict[str, float]) -> float:
+    """The log likelihood ratio that nine recordings of ten exceed when the first rival is true."""
+    d = distance(course, *rivals, sigma, FULL, thorough=True)
+    price = 0.5 * math.log(course.n * len(course.outputs)) * (rivals[1].theta.size - rivals[0].theta.size)
+    return 0.5 * d * d - RELIABLE * d + price
+
+
+def least_waves(group: Group, waves: Mapping[str, Array]) -> dict[str, Array]:
+    """The planned ``waves`` (about zero), as small as the prediction that they split the group allows."""
+
+    def scaled(share: float) -> dict[str, Array]:
+        return {s: share * x for s, x in waves.items()}
+
+    def splits(share: float) -> bool:
+        return predicted(group.where.course(scaled(share)), group.rivals, group.sigma) >= ENOUGH
+
+    if not splits(1.0):
+        return scaled(1.0)
+    high, low = 1.0, 0.5
+    for _ in range(HALVINGS):
+        if not splits(low):
+            break
+        high, low = low, 0.5 * low
+    for _ in range(BISECTIONS):
+        middle = math.sqrt(low * high)
+        if splits(middle):
+            high = middle
+        else:
+            low = middle
+    return scaled(high)
+
+
 def run_one(seed: int, index: int, evaluations: int) -> dict[str, Any]:
     """Draw a group, plan, record both inputs, and compare; what came of it, as a row."""
     began = time.process_time()
@@ -190,12 +253,12 @@ def run_one(seed: int, index: int, evaluations: int) -> dict[str, Any]:
     if group is None:
         return row
     signal = next(iter(group.where.template.inputs))
-    wish = Wish(amplitude=REACH, centre=0.0, duration_s=SAMPLES / RATE_HZ)
-    box = {signal: settle_limits(wish, group.where.template.unit[signal], 1 / RATE_HZ, None, group.twin, None)}
+    box = {signal: settle_limits(WISH, group.where.template.unit[signal], 1 / RATE_HZ, None, group.twin, None)}
     plan = design(group.where, group.rivals, box, group.sigma, evaluations=evaluations, seed=index)
+    least = least_waves(group, plan.waves)
     rng = np.random.default_rng([seed, index, 1])
     ratio = {}
-    for name, waves in (("planned", plan.waves), ("random", random_inputs(plan.waves, box, 1 / RATE_HZ, rng))):
+    for name, waves in (("planned", least), ("random", random_inputs(least, box, 1 / RATE_HZ, rng))):
         course = group.where.course(waves)
         truth = simulated(course, Model(problem_of(course, group.sigma).twin, group.truth.placed), group.truth.theta)
         recorded = with_outputs(course, noisy(truth, group.sigma, rng))
@@ -212,6 +275,8 @@ def run_one(seed: int, index: int, evaluations: int) -> dict[str, Any]:
         "rival": group.rivals[1].name,
         "severity": group.severity,
         "input": plan.description,
+        "amplitude": float(np.max(np.abs(least[signal]))),
+        "predicted": predicted(group.where.course(least), group.rivals, group.sigma),
         "expected_sd": plan.separation,
         "random_expected_sd": plan.random_separation,
         "log_ratio": ratio["planned"],
@@ -223,16 +288,18 @@ def run_one(seed: int, index: int, evaluations: int) -> dict[str, Any]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Counts with exact 95 % intervals (Clopper and Pearson 1934)."""
     drawn = [r for r in rows if r["drawn"]]
-    lines = [
-        ("planned recording splits", sum(r["log_ratio"] >= ENOUGH for r in drawn)),
-        ("random multisine splits", sum(r["random_log_ratio"] >= ENOUGH for r in drawn)),
-        ("planned names the wrong one", sum(r["log_ratio"] <= -ENOUGH for r in drawn)),
-        ("random names the wrong one", sum(r["random_log_ratio"] <= -ENOUGH for r in drawn)),
-    ]
+    promised = [r for r in drawn if r["predicted"] >= ENOUGH]
     text: list[str] = []
-    for label, k in lines:
-        low, high = clopper_pearson(k, len(drawn)) if drawn else (0.0, 1.0)
-        text.append(f"{label:28} {k:3} of {len(drawn):3}   {100 * low:.0f} to {100 * high:.0f} %")
+    for title, some in (("all groups", drawn), ("groups that the plan says it splits", promised)):
+        text.append(title)
+        for label, k in (
+            ("planned recording splits", sum(r["log_ratio"] >= ENOUGH for r in some)),
+            ("random multisine splits", sum(r["random_log_ratio"] >= ENOUGH for r in some)),
+            ("planned names the wrong one", sum(r["log_ratio"] <= -ENOUGH for r in some)),
+            ("random names the wrong one", sum(r["random_log_ratio"] <= -ENOUGH for r in some)),
+        ):
+            low, high = clopper_pearson(k, len(some)) if some else (0.0, 1.0)
+            text.append(f"  {label:28} {k:3} of {len(some):3}   {100 * low:.0f} to {100 * high:.0f} %")
     seconds = sum(r["cpu_s"] for r in drawn)
     goals = f"goals: at least {100 * GOALS[0]:.0f} % and at most {100 * GOALS[1]:.0f} %"
     return "\n".join([*text, goals, f"{len(rows) - len(drawn)} could not be drawn; {seconds:.0f} s of CPU"])
