@@ -133,11 +133,12 @@ def measure_piezo(
         raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
     volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
     what = f"{profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
-    return measure_volts(config, axis, volts, sample_rate_hz(profile), f"{profile}.{rate_hz:g}", what, twin)
+    noise = f"{profile}.{rate_hz:g}"
+    return measure_volts(config, axis, volts, sample_rate_hz(profile), noise=noise, what=what, twin=twin)
 
 
 def measure_volts(
-    config: EmulationConfig, axis: int, volts: Array, read_hz: float, noise: str, what: str, twin: FileTwin | None
+    config: EmulationConfig, axis: int, volts: Array, read_hz: float, *, noise: str, what: str, twin: FileTwin | None
 ) -> tuple[dict[str, Array], str]:
     """Return the columns (n,) of a recording with the demands ``volts`` (n,) at ``read_hz``, and its
     ``recording.toml``. ``noise`` names the stream of the interferometer's noise, ``what`` the demands in the title.

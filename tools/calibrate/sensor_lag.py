@@ -41,9 +41,9 @@ def unfiltered_V(sensing: SensingConfig, force_g: Array) -> Array:
     return np.asarray(np.array(sensing.scale_V_per_g) * (force_g @ np.array(sensing.axes).T), np.float64)
 
 
-def identify_lag(said_V: Array, analog_V: Array, dt: float, hz: Array) -> SensorLag:
+def identify_lag(predicted_V: Array, analog_V: Array, dt: float, hz: Array) -> SensorLag:
     """Fit filter and delay to predicted (n, 6) and recorded (n, 6) readings that have lines at ``hz`` (k,)."""
-    t = np.arange(len(said_V)) * dt
+    t = np.arange(len(predicted_V)) * dt
     angle = 2.0 * np.pi * t[:, None] * hz
     columns = np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(t))])
 
@@ -51,8 +51,8 @@ def identify_lag(said_V: Array, analog_V: Array, dt: float, hz: Array) -> Sensor
         found = np.linalg.lstsq(columns, x, rcond=None)[0]
         return found[: len(hz)] - 1j * found[len(hz) : 2 * len(hz)]
 
-    said, recorded = lines(said_V), lines(analog_V)
-    ratio = np.sum(np.conj(said) * recorded, axis=1) / np.sum(np.abs(said) ** 2, axis=1)
+    predicted, recorded = lines(predicted_V), lines(analog_V)
+    ratio = np.sum(np.conj(predicted) * recorded, axis=1) / np.sum(np.abs(predicted) ** 2, axis=1)
 
     def away(p: Array) -> Array:
         left = ratio - p[2] * lag_at(float(np.exp(p[0])), float(p[1]), hz)

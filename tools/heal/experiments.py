@@ -59,7 +59,9 @@ def twin_of_stack(lab: Lab, axis: int, jobs: int = 1) -> StackTwin:
             write_plan(designed.plan, designed.where, home / "plan", (axis + 1,))
             volts = next(iter(designed.plan.waves.values()))
             planned = home / "planned"
-            columns = measure_volts(lab.config, axis, volts, 1.0 / designed.plan.dt, "planned", "as planned", replaced)
+            columns = measure_volts(
+                lab.config, axis, volts, 1.0 / designed.plan.dt, noise="planned", what="as planned", twin=replaced
+            )
             write_recording(planned, *columns)
             report = diagnose(load_together([first, planned]), jobs=jobs).to_json()
             split = designed.group

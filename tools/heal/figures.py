@@ -14,7 +14,7 @@ from tools.errors import InputError
 from tools.mismatch.recording import Array
 from tools.reports.figures import tremor_figures
 
-BANDS = ("below 2 Hz", "2-8 Hz", "8-12 Hz", "20-500 Hz")
+BANDS: tuple[str, ...] = ("below 2 Hz", "2-8 Hz", "8-12 Hz", "20-500 Hz")
 SLOW = BANDS[0]
 WHOLE = "2-500 Hz"
 SETTLE_S = 2.0

@@ -108,10 +108,10 @@ def heal(
             candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
             after = tip_error(candidate, seconds, seeds)
         except InputError as error:
-            steps.append(_step(part, compared, effects, False, str(error), now, twin))
+            steps.append(_step(part, compared, effects, (False, str(error)), now, twin))
             continue
         kept, why = is_better(now, after)
-        steps.append(_step(part, compared, effects, kept, why, after, twin))
+        steps.append(_step(part, compared, effects, (kept, why), after, twin))
         if kept:
             bench, now = candidate, after
         else:
@@ -161,13 +161,13 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
 
 
 def _step(
-    part: Part, compared: Comparison, effects: tuple[str, ...], kept: bool, why: str, after: TipError,
+    part: Part, compared: Comparison, effects: tuple[str, ...], verdict: tuple[bool, str], after: TipError,
     twin: StackTwin | None,
 ) -> Step:  # fmt: skip
     none = tuple(e for e in effects if e not in STACK_EFFECTS)
     file = str(twin.file) if twin is not None and twin.file is not None else None
     split = twin.split if twin is not None else ()
-    return Step(part.name, compared.rms, compared.unit, effects, none, kept, why, after.mean(), file, split)
+    return Step(part.name, compared.rms, compared.unit, effects, none, *verdict, after.mean(), file, split)
 
 
 def lines(healed: Healed) -> list[str]:
