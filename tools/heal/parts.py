@@ -200,12 +200,12 @@ def identify_tumble(lab: Lab) -> Path:
 
 
 def compare_lag(lab: Lab) -> Comparison:
-    """The delay of the accelerometers at 10 Hz against that of the filter in which the firmware believes."""
+    """Compare the delay of the accelerometers at 10 Hz with that of the filter in which the firmware believes."""
     sensing = load_plan(lab.bench).stages.sensing
-    there = lag_at(1.0 / sensing.cutoff_rad_s, 0.0, TREMOR_HZ)
+    believed = lag_at(1.0 / sensing.cutoff_rad_s, 0.0, TREMOR_HZ)
     found = _lag(lab)
-    here = lag_at(found.filter_s, found.delay_s, TREMOR_HZ)
-    return Comparison(1e3 * abs(float(np.angle(here / there))) / (2.0 * np.pi * TREMOR_HZ), "ms at 10 Hz")
+    measured = lag_at(found.filter_s, found.delay_s, TREMOR_HZ)
+    return Comparison(1e3 * abs(float(np.angle(measured / believed))) / (2.0 * np.pi * TREMOR_HZ), "ms at 10 Hz")
 
 
 def _lag(lab: Lab) -> SensorLag:
@@ -214,13 +214,13 @@ def _lag(lab: Lab) -> SensorLag:
     gravity = lab.config.environment.gravity_m_s2
     attitude = holding_frame(lab.config.hand)
     force_g = (columns["acceleration_m_s2"] + np.array([0.0, 0.0, gravity])) @ attitude / gravity
-    said = unfiltered_V(load_plan(lab.bench).stages.sensing, force_g)
+    unfiltered = unfiltered_V(load_plan(lab.bench).stages.sensing, force_g)
     settled = slice(round(1.0 / NODE_S), None)
-    return identify_lag(said[settled], columns["analog_V"][settled, :6], NODE_S, np.array(SHAKES_HZ))
+    return identify_lag(unfiltered[settled], columns["analog_V"][settled, :6], NODE_S, np.array(SHAKES_HZ))
 
 
 def identify_timing(lab: Lab) -> Path:
-    """The calibration of the accelerometers' filter and of what delays them behind it, from a shaker."""
+    """Write the calibration of the accelerometers' filter and of the delay behind it, from a shaker."""
     found = _lag(lab)
     stages = load_plan(lab.bench).stages
     table = {
