@@ -26,6 +26,7 @@ ROOMS = (
     "tools/guest",
     "tools/heal",
     "tools/imu",
+    "tools/mismatch/report",
     "tools/noise",
     "tools/reports",
     "tools/research/cli",

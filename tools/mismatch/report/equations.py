@@ -15,8 +15,8 @@ _SUBSCRIPT = str.maketrans("0123456789ijkhd", "₀₁₂₃₄₅₆₇₈₉ᵢ
 
 
 def plain(tex: str) -> str:
-    """One line of Unicode text, e.g. ``y = x + Σⱼ cⱼ zⱼ``."""
-    # a command swallows the space behind it
+    """Return TeX as one line of Unicode text, e.g. ``y = x + Σⱼ cⱼ zⱼ``."""
+    # a TeX command consumes the space behind it
     text = re.sub(r"\\([dD])elta\s+(?=[A-Za-z])", r"\\\1elta{}", tex)
     text = re.sub(r"\\quad", "   ", text)
     text = re.sub(r"\\(?:mathrm|text)\{([^{}]*)\}", r"\1", text)

@@ -1,4 +1,4 @@
-"""Pictures of a report: what was measured and simulated, and what the residual looks like before and after."""
+"""Draws the pictures of a report: measured and simulated courses, and the residual before and after."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 WIDTH_IN = 11.6
 HALF_IN = 5.7
 POINTS = 600
-"""Dots of a cloud: enough to see its shape, few enough for a page of a megabyte."""
+"""Number of dots of a cloud: enough to see its shape, few enough for a page of a megabyte."""
 
 
 def _improved(report: Report) -> bool:
@@ -30,7 +30,7 @@ def _shade_held_out(ax: Any, p: Pictures) -> None:
 
 
 def _residuals(report: Report, p: Pictures, output: str) -> list[tuple[str, str, Array]]:
-    """(label, colour, residual): recalibrated, and with physics when there is any."""
+    """Return (label, colour, residual) of the recalibrated twin, and of the twin with physics when there is any."""
     before = ("recalibrated", BEFORE, p.measured[output] - p.recalibrated[output])
     if not _improved(report):
         return [before]
@@ -38,12 +38,12 @@ def _residuals(report: Report, p: Pictures, output: str) -> list[tuple[str, str,
 
 
 def _legend(ax: Any) -> None:
-    """Above the axes, beside the title: it hides nothing."""
+    """Place the legend above the axes, beside the title, where it hides nothing."""
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.985), ncols=5, fontsize=9, borderaxespad=0.2)
 
 
 def overlay(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Measured, as given, recalibrated and fitted: the whole record, and a few held-out cycles close up."""
+    """Draw measured, as-given, recalibrated and fitted courses: the whole record and a close-up of held-out cycles."""
     measured = p.measured[output]
     factor, unit = scaled(float(np.ptp(measured)), report.fit.unit[output])
     a, b = series.zoom(p, output)
@@ -72,7 +72,7 @@ def overlay(report: Report, p: Pictures, output: str, name: str) -> str:
 
 
 def residual(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Residual before and after over time; held-out data in full colour, fitted data faint."""
+    """Draw the residual before and after over time; held-out data in full colour, fitted data faint."""
     noise = report.fit.noise_floor_rms[output]
     factor, unit = _residual_unit(report, output)
     with figure(name, (WIDTH_IN, 2.9)) as (fig, out):
@@ -101,7 +101,7 @@ def residual(report: Report, p: Pictures, output: str, name: str) -> str:
 
 
 def follows(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Held-out residual against what it follows: clouds and running means, before and after."""
+    """Draw the held-out residual against the signal that it follows: clouds and running means, before and after."""
     axes: list[tuple[str, Array, str]] = []
     for d in report.location.depends_on:
         found = series.axis_of(p, d)
@@ -135,7 +135,7 @@ def _residual_unit(report: Report, output: str) -> tuple[float, str]:
 
 
 def _dots(ax: Any, x: Array, y: Array, colour: str) -> None:
-    """A cloud as one path of points with round ends: a tenth of the page that one element per dot would take."""
+    """Draw a cloud as one path of points with round ends, which takes a tenth of the size of one element per dot."""
     width = 1e-4 * (float(np.ptp(x)) or 1.0)
     gap = np.full(x.size, np.nan)
     line = (np.column_stack([x, x + width, gap]).ravel(), np.column_stack([y, y, gap]).ravel())
@@ -143,7 +143,7 @@ def _dots(ax: Any, x: Array, y: Array, colour: str) -> None:
 
 
 def spectra(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Amplitude density of the held-out residual before and after, and of the noise floor if it were white."""
+    """Draw the amplitude density of the held-out residual before and after, and of a white noise floor."""
     dt = series.step_s(p)
     factor, unit = _residual_unit(report, output)
     spans = series.runs(p.held_out, p.t) or series.runs(~p.held_out, p.t)
@@ -162,7 +162,7 @@ def spectra(report: Report, p: Pictures, output: str, name: str) -> str:
 
 
 def _thin(f: Array, y: Array, most: int = 500) -> tuple[Array, Array]:
-    """At most ``most`` points, geometrically spaced, each the root mean square of its band."""
+    """Reduce a spectrum to at most ``most`` points, geometrically spaced, each the root mean square of its band."""
     if f.size <= most:
         return f, y
     edges = np.unique(np.geomspace(1, f.size, most).astype(int)) - 1
@@ -171,7 +171,7 @@ def _thin(f: Array, y: Array, most: int = 500) -> tuple[Array, Array]:
 
 
 def autocorrelations(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Autocorrelation of the held-out residual, with the band in which a white one stays."""
+    """Draw the autocorrelation of the held-out residual, with the band in which that of white noise stays."""
     spans = series.runs(p.held_out, p.t) or series.runs(~p.held_out, p.t)
     dt = series.step_s(p)
     with figure(name, (HALF_IN, 3.2)) as (fig, out):
@@ -191,7 +191,7 @@ def autocorrelations(report: Report, p: Pictures, output: str, name: str) -> str
 
 
 def between(together: Together, parameter: BetweenRecordings, name: str) -> str:
-    """A parameter in each recording, with 95 % intervals, against the condition that it follows (else their order)."""
+    """Draw a parameter of each recording, with 95 % intervals, over the condition that it follows, else in order."""
     change = next((c for c in together.changes if c.parameter == parameter.name), None)
     condition = change.condition if change is not None else "order"
     at = together.conditions[condition]

@@ -1,4 +1,4 @@
-"""The next recording worth making: what would settle what this one left open."""
+"""Proposes the next recording: one that settles the questions which this one left open."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tools.mismatch.report.wording import label, number, percent, poorly_known, 
 
 @dataclass(frozen=True)
 class Experiment:
-    """``what`` to record, and ``why``: the question that it answers."""
+    """Proposes ``what`` to record, and says ``why``: the question that it answers."""
 
     what: str
     why: str
@@ -33,7 +33,7 @@ _FOLLOWS = {
 
 
 def next_experiments(report: Report) -> list[Experiment]:
-    """Likeliest to be worth it first; never empty."""
+    """Return the experiments, the most useful first; never empty."""
     found = [
         Experiment(words(e.tell_apart_by), f"tells apart {', '.join(words(n) for n in e.names)}")
         for e in report.equivalent

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: everything inline, nothing fetched, readable in light and dark."""
+"""Renders a report as a self-contained HTML page: everything inline, nothing fetched, readable in light and dark."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ BASE_EQUATIONS: Mapping[str, str] = MappingProxyType(
         "state_space": r"\dot x = A x + B u,\quad y = C x + D u + y_0",
     }
 )
-"""The contract's base physics (section 2), in TeX."""
+"""Base physics of the contract (section 2), in TeX."""
 
 
 def html_page(report: Report) -> str:
-    """The page. Needs ``report.pictures``; without them only text and tables are shown."""
+    """Return the page. Without ``report.pictures`` it has text and tables only."""
     from jinja2 import Environment, StrictUndefined
 
     source = Path(__file__).with_name("page.html.j2").read_text(encoding="utf-8")
@@ -87,7 +87,7 @@ def _base_equation(report: Report) -> str:
 
 
 def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
-    factor, shown = wording.shown_in(report.fit, p.output, max(p.residual_rms_before, p.residual_rms_after))
+    factor, unit = wording.shown_in(report.fit, p.output, max(p.residual_rms_before, p.residual_rms_after))
     known = EFFECTS.get(p.name)
     return {
         "found": p,
@@ -100,14 +100,14 @@ def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
         ],
         "before": number(p.residual_rms_before * factor),
         "after": number(p.residual_rms_after * factor),
-        "unit": shown,
+        "unit": unit,
         "confidence": percent(p.confidence),
         "plain": plain(p.equation),
     }
 
 
 def _bars(report: Report) -> list[dict[str, Any]]:
-    """Per output the four figures of the fit as bars; one scale per output."""
+    """Return per output the four figures of the fit as bars, with one scale per output."""
     f = report.fit
     out: list[dict[str, Any]] = []
     for o in f.unit:
@@ -120,13 +120,13 @@ def _bars(report: Report) -> list[dict[str, Any]]:
         # one hopeless figure (an unstable twin) must not hide the others
         second = sorted(finite)[-2] if len(finite) > 1 else longest
         top = min(longest, 4 * second) or 1.0
-        factor, shown = wording.shown_in(f, o, second)
+        factor, unit = wording.shown_in(f, o, second)
         rows = [
             (label, kind, number(v * factor), min(100.0, 100 * v / top) if math.isfinite(v) else 100.0, not v <= top)
             for label, kind, v in values
         ]
         share = percent(wording.explained(f, o)) if report.physics else "-"
-        out.append({"output": o, "unit": shown, "rows": rows, "explained": share})
+        out.append({"output": o, "unit": unit, "rows": rows, "explained": share})
     return out
 
 
@@ -158,7 +158,7 @@ def _pictures(report: Report) -> list[dict[str, str]]:
 
 
 def _between(report: Report) -> dict[str, Any] | None:
-    """What several recordings say of each other, None for one."""
+    """Return the section on several recordings, None for one recording."""
     together = report.together
     if together is None:
         return None
@@ -171,12 +171,12 @@ def _between(report: Report) -> dict[str, Any] | None:
 
 
 def _limits(report: Report) -> dict[str, Any]:
-    """Effects by output; a row per effect, least output first."""
+    """Return the detection limits as a table: a row per effect, a column per output; smallest limit first."""
     outputs = list(report.detection_limit)
     names = dict.fromkeys(n for of in report.detection_limit.values() for n in of)
     units = {o: wording.shown_in(report.fit, o, report.fit.noise_floor_rms.get(o, 1.0)) for o in outputs}
 
-    def shown(o: str, n: str) -> str:
+    def limit_text(o: str, n: str) -> str:
         v = report.detection_limit[o].get(n)
         return "-" if v is None else number(v * units[o][0])
 
@@ -184,5 +184,5 @@ def _limits(report: Report) -> dict[str, Any]:
     order = sorted(names, key=lambda n: report.detection_limit[first].get(n) or math.inf)
     return {
         "outputs": [(o, units[o][1]) for o in outputs],
-        "rows": [(words(n), [shown(o, n) for o in outputs]) for n in order],
+        "rows": [(words(n), [limit_text(o, n) for o in outputs]) for n in order],
     }

@@ -1,4 +1,4 @@
-"""Arrays of a report made fit for drawing: gaps, envelopes, held-out stretches, what to put on an axis."""
+"""Prepares arrays of a report for drawing: gaps, envelopes, held-out stretches, quantities of the axes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ CYCLES = 8  # of the strongest frequency, in a close-up
 
 
 def step_s(p: Pictures) -> float:
-    """Seconds between samples."""
+    """Return the time between samples, s."""
     return float(np.min(np.diff(p.t)))
 
 
 def runs(mask: NDArray[np.bool_], t: Array) -> list[Span]:
-    """Rows (start, stop) of stretches where ``mask`` (m,) holds and time ``t`` (m,) has no gap."""
+    """Return rows (start, stop) of the stretches where ``mask`` (m,) holds and time ``t`` (m,) has no gap."""
     if t.size == 0:
         return []
     gap = np.diff(t) > 1.5 * np.min(np.diff(t)) if t.size > 1 else np.zeros(0, bool)
@@ -33,7 +33,7 @@ def runs(mask: NDArray[np.bool_], t: Array) -> list[Span]:
 
 
 def drawn_outputs(report: Report, most: int = 3) -> list[str]:
-    """Outputs worth a picture: the guilty ones, else the one with most residual over its noise."""
+    """Return the outputs to draw: those with a mismatch, else the one with the largest residual over its noise."""
     f = report.fit
     order = sorted(f.unit, key=lambda o: -f.recalibrated_rms[o] / max(f.noise_floor_rms[o], 1e-300))
     guilty = [o for o in order if o in report.location.outputs]
@@ -41,8 +41,10 @@ def drawn_outputs(report: Report, most: int = 3) -> list[str]:
 
 
 def envelope_line(t: Array, y: Array, columns: int = 900) -> tuple[Array, Array]:
-    """A line (k,) with the least and the greatest of every column in the order in which they come: nothing that a
-    plot could show is lost. Gaps in time become NaN."""
+    """Reduce a line to the least and greatest value of every pixel column, in order of time, (k,).
+
+    The plot loses nothing that it could show. Gaps in time become NaN.
+    """
     parts_t: list[Array] = []
     parts_y: list[Array] = []
     per = max(1, t.size // columns)
@@ -62,7 +64,7 @@ def envelope_line(t: Array, y: Array, columns: int = 900) -> tuple[Array, Array]
 
 
 def zoom(p: Pictures, output: str) -> Span:
-    """Rows of a held-out stretch of a few cycles where the recalibrated twin is worst."""
+    """Return the rows of a held-out stretch of a few cycles where the recalibrated twin is worst."""
     residual = p.measured[output] - p.recalibrated[output]
     spans = runs(p.held_out, p.t) or [(0, p.t.size)]
     a, b = max(spans, key=lambda s: float(np.mean(residual[s[0] : s[1]] ** 2)))
@@ -76,7 +78,7 @@ def zoom(p: Pictures, output: str) -> Span:
 
 
 def autocorrelation(residual: Array, spans: list[Span], most: int = 200) -> tuple[Array, float]:
-    """(lags + 1,) autocorrelation over stretches, and the 95 % band of a white residual."""
+    """Return the autocorrelation (lags + 1,) over stretches, and the 95 % band of a white residual."""
     longest = max(b - a for a, b in spans)
     lags = max(2, min(most, longest // 3))
     total, count = np.zeros(lags + 1), 0
@@ -91,7 +93,7 @@ def autocorrelation(residual: Array, spans: list[Span], most: int = 200) -> tupl
 
 
 def spectrum(residual: Array, spans: list[Span], dt: float) -> tuple[Array, Array]:
-    """(frequency Hz, amplitude density in unit/sqrt(Hz)) by Welch over stretches."""
+    """Return (frequency Hz, amplitude density in unit/sqrt(Hz)) by Welch's method over stretches."""
     from scipy.signal import welch
 
     length = int(min(4096, max(np.median([b - a for a, b in spans]), 16)))
@@ -110,7 +112,7 @@ def spectrum(residual: Array, spans: list[Span], dt: float) -> tuple[Array, Arra
 
 
 def axis_of(p: Pictures, d: DependsOn) -> tuple[str, Array] | None:
-    """Label and values (m,) of what a residual follows; None when it was not recorded."""
+    """Return label and values (m,) of the quantity that a residual follows; None if it was not recorded."""
     dt = step_s(p)
     seconds = max(20 * dt, p.t.size * dt / 60)
     if d.signal == "time":
@@ -130,21 +132,22 @@ def axis_of(p: Pictures, d: DependsOn) -> tuple[str, Array] | None:
     label, make = makers.get(d.feature, ("{}", lambda v: v))
     unit = p.units.get(d.signal, "")
     over = {"rate": "/s", "sign of rate": "/s", "acceleration": "/s²"}.get(d.feature, "")
-    shown = "" if unit in ("", "1") or "(" in label else f" ({unit}{over})"
-    return label.format(d.signal) + shown, make(x)
+    suffix = "" if unit in ("", "1") or "(" in label else f" ({unit}{over})"
+    return label.format(d.signal) + suffix, make(x)
 
 
 def binned(x: Array, y: Array, bins: int = 24) -> tuple[Array, Array]:
-    """Mean of ``y`` in bins of equal count along ``x``. (A median would jump between the branches of a loop.)"""
+    """Return the mean of ``y`` in bins of equal count along ``x``; a median would jump between a loop's branches."""
     order = np.argsort(x, kind="stable")
     parts = [i for i in np.array_split(order, min(bins, max(2, x.size // 20))) if i.size]
     return np.array([float(x[i].mean()) for i in parts]), np.array([float(y[i].mean()) for i in parts])
 
 
 def limit(residuals: list[Array], held_out: NDArray[np.bool_]) -> float | None:
-    """Half height of a residual's axis when something outside the held-out data (a start-up, a knock) would flatten
-    them; else None."""
+    """Return the half height of a residual's axis where other data (a start-up, a knock) would flatten the held-out
+    data; else None.
+    """
     if not held_out.any():
         return None
-    shown = 1.15 * max(float(np.max(np.abs(e[held_out]))) for e in residuals)
-    return shown if max(float(np.max(np.abs(e))) for e in residuals) > 2 * shown > 0 else None
+    height = 1.15 * max(float(np.max(np.abs(e[held_out]))) for e in residuals)
+    return height if max(float(np.max(np.abs(e))) for e in residuals) > 2 * height > 0 else None

@@ -1,4 +1,4 @@
-"""Drawings that follow the theme of the page they sit in: matplotlib figures, equations, the chain of stages."""
+"""Makes drawings that follow the theme of their page: matplotlib figures, equations, the chain of stages."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ INK, MUTED, RULE, BEFORE, AFTER, MEASURED, NOISE, HELD, GIVEN = THEME
 
 @contextmanager
 def figure(name: str, size_in: tuple[float, float], **kwargs: Any) -> Iterator[tuple[Any, list[str]]]:
-    """A matplotlib figure; the list holds its SVG afterwards. ``name`` keeps ids apart on one page."""
+    """Yield a matplotlib figure; the list holds its SVG afterwards. ``name`` makes its ids unique on the page."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -74,7 +74,7 @@ def figure(name: str, size_in: tuple[float, float], **kwargs: Any) -> Iterator[t
 
 
 def themed(svg: str, name: str) -> str:
-    """An SVG document as an element of a page: the page's colours, ids that no other figure has, any width."""
+    """Return an SVG document as an element of a page: with the page's colours, unique ids and any width."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
     for colour, variable in THEME.items():
@@ -87,12 +87,12 @@ def themed(svg: str, name: str) -> str:
 
 
 def _rounded(path: re.Match[str]) -> str:
-    """Coordinates to a hundredth of a point."""
+    """Round the coordinates to a hundredth of a point."""
     return re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", path[0]).replace("\n", " ")
 
 
 def equation(tex: str) -> str:
-    """An equation set in type, as tall as the text around it."""
+    """Return a typeset equation as tall as the text around it."""
     import matplotlib as mpl
     from matplotlib.font_manager import FontProperties
     from matplotlib.path import Path as Outline
@@ -124,7 +124,7 @@ def equation(tex: str) -> str:
 
 
 def chain(stages: Sequence[str], guilty: Mapping[str, str], ends: tuple[str, str]) -> str:
-    """The stages from input to output as boxes with arrows; ``guilty``: stage -> what is wrong there."""
+    """Draw the stages from input to output as boxes with arrows; ``guilty`` maps a stage to its fault."""
     wide, tall, gap, side, top = 128, 44, 30, 92, 10
     width = 2 * side + len(stages) * wide + (len(stages) + 1) * gap
     height = top + tall + (50 if guilty else 12)

@@ -1,4 +1,4 @@
-"""The report for a terminal."""
+"""Prints a report on a terminal."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ def _fit(report: Report) -> Table:
     t = _table("output", "as given", "re-fitted", "with physics", "noise floor", "explained")
     f = report.fit
     for o in f.unit:
-        factor, shown = wording.shown_in(f, o, f.recalibrated_rms[o])
+        factor, unit = wording.shown_in(f, o, f.recalibrated_rms[o])
         figures = (f.base_rms[o] * factor, f.recalibrated_rms[o] * factor, f.fitted_rms[o] * factor)
         floor = f"{wording.floor_of(f, o, factor)} ({f.noise_method.get(o, '')})"
-        t.add_row(Text(f"{o} ({shown})"), *map(number, figures), floor, percent(wording.explained(f, o)))
+        t.add_row(Text(f"{o} ({unit})"), *map(number, figures), floor, percent(wording.explained(f, o)))
     return t
 
 
@@ -107,15 +107,15 @@ def _runners_up(report: Report) -> Table:
 
 
 def _limits(report: Report) -> Table:
-    """All of them where nothing was found: 'agrees' says nothing without them. Else the range."""
+    """Return the detection limits: all where nothing was found, because 'agrees' depends on them, else the range."""
     rows: list[tuple[str, str]] = []
     for o, of in report.detection_limit.items():
         known = sorted((v, n) for n, v in of.items() if v is not None)
         factor, unit = wording.shown_in(report.fit, o, report.fit.noise_floor_rms.get(o, 1.0))
-        said = [f"{words(n)} {number(v * factor)}" for v, n in known]
-        if report.verdict in ("missing_physics", "unexplained") and len(said) > 3:
-            said = [f"{said[0]} .. {said[-1]} (all in --json and --html)"]
-        rows.append((f"{o} ({unit} rms)", ", ".join(said) or "none"))
+        limits = [f"{words(n)} {number(v * factor)}" for v, n in known]
+        if report.verdict in ("missing_physics", "unexplained") and len(limits) > 3:
+            limits = [f"{limits[0]} .. {limits[-1]} (all in --json and --html)"]
+        rows.append((f"{o} ({unit} rms)", ", ".join(limits) or "none"))
     return _pairs(rows)
 
 
@@ -135,14 +135,14 @@ def _checks(report: Report) -> Table:
 
 
 def _together(together: Together, fit: FitSummary) -> RenderableType:
-    rows = [("left out", f"{o}: {said}") for o, said in words_together.score_rows(together, fit)]
+    rows = [("left out", f"{o}: {figures}") for o, figures in words_together.score_rows(together, fit)]
     rows += [("changes", line) for line in words_together.change_lines(together)]
     rows += [(p.name, words_together.range_text(p)) for p in together.parameters]
     return _pairs(rows)
 
 
 def render(report: Report) -> RenderableType:
-    """The whole report."""
+    """Return the whole report."""
     colour = _COLOUR[report.verdict]
     parts: list[RenderableType] = [
         Panel(
@@ -190,16 +190,16 @@ def render(report: Report) -> RenderableType:
 
 
 def print_report(report: Report, console: Console) -> None:
-    """Print it."""
+    """Print the report."""
     console.print(render(report))
 
 
 def batch_report(rows: Sequence[dict[str, str]]) -> RenderableType:
-    """One line per recording of a folder (see ``batch.Row.cells``), then those without a report and why."""
+    """Print a line per recording of a folder (see ``batch.Row.cells``), then those without a report and why."""
     t = _table("recording", "verdict", "physics", "worst output", "re-fit", "fitted", "noise", "s", left=4)
     t.padding = (0, 1, 0, 0)
     for column in t.columns:
-        # words break between words, figures never: eight columns on a terminal of eighty
+        # text wraps between words and figures do not wrap: eight columns fit a terminal of eighty characters
         column.no_wrap = column.header not in ("physics", "worst output")
     t.columns[2].min_width = t.columns[3].min_width = 12
     failed: list[RenderableType] = []

@@ -1,4 +1,4 @@
-"""The vocabulary of physics for people: what each effect is, its formula, parameters, source and excitation."""
+"""Describes the vocabulary of physics for people: each effect's formula, parameters, source and excitation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNITS = "units: {in} and {out} are those of the twin's input and output"
 
 @dataclass(frozen=True)
 class Entry:
-    """One effect. ``equations``: TeX, one per place in the equations; ``parameters``: as reports give them."""
+    """Describes an effect. ``equations``: TeX, one per place in the equations; ``parameters``: as in reports."""
 
     name: str
     summary: str
@@ -46,7 +46,7 @@ _ACTS = {
 
 
 def entries() -> list[Entry]:
-    """Every effect, in the contract's order."""
+    """Return every effect, in the contract's order."""
     return [_entry(e) for e in EFFECTS.values()]
 
 
@@ -68,8 +68,10 @@ def _entry(effect: Effect) -> Entry:
 
 
 def _parameters(effect: Effect) -> tuple[tuple[str, str], ...]:
-    """Names and units under which a report gives its parameters: read from a made-up example, since several
-    effects decide on their elements by the data."""
+    """Return names and units of an effect's parameters in reports.
+
+    They are read from a synthetic example, since several effects choose their elements by the data.
+    """
     t = np.arange(512, dtype=np.float64) * 0.01
     wave = np.sin(2 * np.pi * t / 1.7) + 0.3 * np.sin(2 * np.pi * t / 0.4)
     residual = 0.1 * np.roll(wave, 5) + 0.05 * np.sin(2 * np.pi * 10 * t) + 0.02 * t
@@ -107,7 +109,7 @@ def to_json(found: Sequence[Entry]) -> dict[str, Any]:
 
 
 def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
-    """For a terminal."""
+    """Print the vocabulary on a terminal."""
     for e in found:
         console.print(Text.assemble((e.name, "bold yellow"), "  ", e.summary))
         t = Table.grid(padding=(0, 2, 0, 0))

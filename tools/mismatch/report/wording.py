@@ -34,19 +34,19 @@ MEANINGS: Mapping[str, str] = {
     "unknown": "the noise floor is known well enough, the fit holds and every place of this twin was tried: no effect"
     " of the vocabulary does this",
 }
-"""What an ``unexplained`` means, and what to do about it."""
+"""Meanings of the verdict ``unexplained``, with the advice for each."""
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
-MUCH = 1.5  # residual over noise floor that deserves a word whatever the verdict
-SHOWABLE = 1.05  # residual over noise floor below which nothing is left to be explained
+MUCH = 1.5  # ratio of residual to noise floor above which every report mentions the rest
+SHOWABLE = 1.05  # ratio of residual to noise floor below which nothing is left to be explained
 
 
 def number(value: float | None) -> str:
-    """Three significant digits, without a power of ten up to a million; '-' for what is not known."""
+    """Return three significant digits, without a power of ten up to a million; '-' for an unknown value."""
     return "-" if value is None or not math.isfinite(value) else f"{float(f'{value:.3g}'):g}"
 
 
 def chance(p: float) -> str:
-    """A p-value as one may believe it: no tail of a distribution is known beyond one in a million million."""
+    """Return a p-value as text, bounded below: no tail of a distribution is known beyond 1e-12."""
     return "p < 1e-12" if p < 1e-12 else f"p = {number(p)}"
 
 
@@ -55,8 +55,10 @@ _SCALABLE = {"V", "A", "N", "m", "g", "rad", "m/s", "m/s^2", "rad/s"}
 
 
 def scaled(typical: float, unit: str, file_unit: str = "") -> tuple[float, str]:
-    """A factor and a unit to show a difference in: that of the data file where it is another than ``unit``, else one in
-    which ``typical`` is at least 1 where an SI prefix can do it, e.g. (1e3, "mV").
+    """Return a factor and a unit in which to show a difference, e.g. (1e3, "mV").
+
+    The unit is that of the data file if it differs from ``unit``, else one with an SI prefix that makes ``typical`` at
+    least 1 where possible.
     """
     if file_unit and file_unit != unit:
         return units.convert_difference(1.0, unit, file_unit), file_unit
@@ -67,33 +69,33 @@ def scaled(typical: float, unit: str, file_unit: str = "") -> tuple[float, str]:
 
 
 def shown_in(fit: FitSummary, output: str, typical: float) -> tuple[float, str]:
-    """A factor and a unit to show differences of an output in (``scaled``)."""
+    """Return a factor and a unit in which to show differences of an output (``scaled``)."""
     return scaled(typical, fit.unit.get(output, ""), fit.file_unit.get(output, ""))
 
 
 def percent(share: float | None) -> str:
-    """A share as a percentage, '-' for what is not known."""
+    """Return a share as a percentage, '-' for an unknown one."""
     return "-" if share is None or not math.isfinite(share) else f"{100 * share:.0f} %"
 
 
 def words(name: str) -> str:
-    """The name of an effect in running text."""
+    """Return the name of an effect for running text."""
     return name.replace("_", " ")
 
 
 def label(name: str, unit: str) -> str:
-    """A parameter's name without the unit that stands beside it: 'time_constant_s' in s is 'time constant'."""
+    """Return a parameter's name without its unit: 'time_constant_s' in s is 'time constant'."""
     short = name[: -len(unit) - 1] if name.lower().endswith(f"_{unit.lower()}") else name
     return words(short)
 
 
 def interval(p: ParameterValue) -> tuple[str, str, str]:
-    """See ``interval_of``."""
+    """Return the interval of an estimate (see ``interval_of``)."""
     return interval_of(p.value, p.ci95)
 
 
 def interval_of(value: float, ci95: tuple[float, float]) -> tuple[str, str, str]:
-    """A value and both ends of its interval, with as many digits as the interval justifies."""
+    """Return a value and both ends of its interval, with as many digits as the interval justifies."""
     lo, hi = ci95
     half = (hi - lo) / 2
     if not all(map(math.isfinite, (value, lo, hi))) or half <= 0:
@@ -107,7 +109,7 @@ def interval_of(value: float, ci95: tuple[float, float]) -> tuple[str, str, str]
 
 
 def poorly_known(p: ParameterValue) -> float | None:
-    """Half the interval over the value where that is too much, else None."""
+    """Return half the interval over the value if that exceeds ``WELL_KNOWN``, else None."""
     half = (p.ci95[1] - p.ci95[0]) / 2
     if not math.isfinite(half) or p.value == 0:
         return None
@@ -116,7 +118,7 @@ def poorly_known(p: ParameterValue) -> float | None:
 
 
 def explained(fit: FitSummary, output: str) -> float | None:
-    """Share of what re-fitting left above the noise that the physics explains; None where nothing was left."""
+    """Return the share of the re-fitted residual above the noise that the physics explains; None without any."""
     before, after = fit.recalibrated_rms[output], fit.fitted_rms[output]
     noise = fit.noise_floor_rms[output]
     if not before > SHOWABLE * noise:
@@ -125,12 +127,12 @@ def explained(fit: FitSummary, output: str) -> float | None:
 
 
 def windows(location: Location, most: int = 6) -> str:
-    """The time windows in one line."""
+    """Return the time windows in one line."""
     if not location.windows:
         return "none"
-    shown = ", ".join(f"{number(w.start_s)} to {number(w.stop_s)} s" for w in location.windows[:most])
+    text = ", ".join(f"{number(w.start_s)} to {number(w.stop_s)} s" for w in location.windows[:most])
     more = len(location.windows) - most
-    return shown + (f" and {more} more" if more > 0 else "")
+    return text + (f" and {more} more" if more > 0 else "")
 
 
 def follows(location: Location) -> str:
@@ -147,7 +149,7 @@ def base_rows(report: Report) -> tuple[BaseShift, ...]:
 
 
 def guilty_stages(report: Report) -> tuple[str, ...]:
-    """Stages to mark in the chain: where physics was found, or where the leftover is guessed to sit."""
+    """Return the stages to mark in the chain: those with physics, or the guessed place of the rest."""
     found = tuple(dict.fromkeys(p.stage for p in report.physics))
     if report.verdict == "missing_physics":
         return found
@@ -155,7 +157,7 @@ def guilty_stages(report: Report) -> tuple[str, ...]:
 
 
 def cautions(report: Report) -> list[str]:
-    """What to look at before believing the verdict: the checks' messages, and a residual that no verdict covers."""
+    """Return the cautions about a verdict: the checks' messages, and a residual that no verdict covers."""
     out = list(report.checks.messages)
     if report.one_way is not None:
         out.append(one_way(report.one_way))
@@ -182,7 +184,7 @@ def cautions(report: Report) -> list[str]:
 
 
 def floor_of(fit: FitSummary, output: str, factor: float) -> str:
-    """The noise floor of an output: one figure, or the two ends of its interval where these differ by half or more."""
+    """Return the noise floor of an output: a figure, or both ends of its interval if they differ by half or more."""
     lo, hi = fit.noise_floor_interval.get(output, (math.nan, math.nan))
     if math.isfinite(lo) and math.isfinite(hi) and hi > 1.5 * lo:
         return f"{number(lo * factor)} to {number(hi * factor)}"
@@ -190,16 +192,16 @@ def floor_of(fit: FitSummary, output: str, factor: float) -> str:
 
 
 def one_way(found: OneWay) -> str:
-    """Return what a load that moved one way only leaves open, and the reversal that would tell."""
+    """Return the question that a load which moved one way leaves open, and the reversal that would answer it."""
     way = "forwards" if found.direction > 0 else "backwards"
-    said = f"{found.output} only ever moved {way}: dry friction would show as an offset of the force"
+    text = f"{found.output} only ever moved {way}: dry friction would show as an offset of the force"
     if found.offset is not None:
         value, lo, hi = interval(found.offset)
         p = found.offset
-        said += f", which moved by {value} ({lo} .. {hi}) {p.unit} when re-fitted"
+        text += f", which moved by {value} ({lo} .. {hi}) {p.unit} when re-fitted"
         against = p.value * found.direction < 0 and not p.ci95[0] <= 0.0 <= p.ci95[1]
-        said += ": that may be friction of this size" if against else ""
-    return f"{said}; record a reversal of {number(found.reversal)} {found.unit} or more"
+        text += ": that may be friction of this size" if against else ""
+    return f"{text}; record a reversal of {number(found.reversal)} {found.unit} or more"
 
 
 _HOLDS = {
@@ -211,27 +213,27 @@ _HOLDS = {
 
 
 def hold(report: Report) -> str:
-    """Return what the inputs do between their samples, in one line; "" for a twin without memory."""
+    """Return a line on the course of inputs between their samples; "" for a twin without memory."""
     by: dict[str, list[str]] = {}
     for s, h in report.hold.items():
         kind = "held" if h.kind == "zero" else h.kind
         by.setdefault(f"{kind} between samples ({_HOLDS[h.how]})", []).append(s)
-    return "; ".join(f"{', '.join(of)} {said}" for said, of in by.items())
+    return "; ".join(f"{', '.join(of)} {kind_text}" for kind_text, of in by.items())
 
 
 def meaning(report: Report) -> str:
-    """Return what the verdict ``unexplained`` means on this recording, as one sentence; "" for the other verdicts."""
-    said = MEANINGS.get(report.meaning, "")
-    return f"{said}: {'; '.join(report.trouble)}" if report.trouble and said else said
+    """Return the meaning of ``unexplained`` on this recording as one sentence; "" for the other verdicts."""
+    text = MEANINGS.get(report.meaning, "")
+    return f"{text}: {'; '.join(report.trouble)}" if report.trouble and text else text
 
 
 def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:
-    """Sample ranges as times, e.g. '0 to 12.5 s, 14 to 30 s'."""
+    """Return sample ranges as times, e.g. '0 to 12.5 s, 14 to 30 s'."""
     return ", ".join(f"{number(a * dt_s)} to {number(b * dt_s)} s" for a, b in of) or "none"
 
 
 def step_s(report: Report) -> float | None:
-    """Seconds per sample, from the pictures; None without them."""
+    """Return the time step in s from the pictures; None without them."""
     p = report.pictures
     if p is None or p.t.size < 2:
         return None
@@ -248,7 +250,7 @@ UNSEALED = MappingProxyType(
 
 
 def data_parts(report: Report) -> list[tuple[str, str]]:
-    """What of the recording was fitted, held out and sealed, and what the sealed part says."""
+    """Return rows on the parts of the recording that were fitted, held out and sealed, and the sealed part's scores."""
     f, dt_s = report.fit, step_s(report)
     say = lambda of: f"samples {list(of)}" if dt_s is None else spans(of, dt_s)  # noqa: E731
     rows = [("fitted on", say(f.fit_spans)), ("held out", say(f.held_out_spans))]
@@ -260,22 +262,22 @@ def data_parts(report: Report) -> list[tuple[str, str]]:
     for o, last in f.sealed.fitted_rms.items():
         given, again = f.sealed.base_rms[o], f.sealed.recalibrated_rms[o]
         factor, unit = shown_in(f, o, again)
-        said = f"{number(given * factor)} as given, {number(again * factor)} re-fitted"
+        figures = f"{number(given * factor)} as given, {number(again * factor)} re-fitted"
         if report.physics:
-            said += f", {number(last * factor)} with physics"
-        rows.append((f"  {o}", f"{said} ({unit} rms)"))
+            figures += f", {number(last * factor)} with physics"
+        rows.append((f"  {o}", f"{figures} ({unit} rms)"))
     return rows
 
 
 def before_after(p: PhysicsFound, fit: FitSummary) -> str:
-    """Return what one effect does to the held-out residual of its output."""
+    """Return how much an effect lowers the held-out residual of its output."""
     factor, unit = shown_in(fit, p.output, max(p.residual_rms_before, p.residual_rms_after))
     without, within = number(p.residual_rms_before * factor), number(p.residual_rms_after * factor)
     return f"{without} without it, {within} with it ({unit} rms, held out)"
 
 
 def why_withheld(w: Withheld, fit: FitSummary) -> str:
-    """Why an effect that lowered the residual is not named, with the figures that show it."""
+    """Return why an effect that lowered the residual is not named, with the figures that show it."""
     names = ", ".join(words(n) for n in w.shown_by)
     if w.reason == "below_tolerance":
         why = "the difference that it makes is below your tolerance"
@@ -284,12 +286,12 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
     elif w.reason == "unlikely":
         why = "beside what is left unexplained it is too likely to be wrong"
     else:
-        shown = []
+        sizes = []
         for n in w.shown_by[:3]:
             p = w.parameters[n]
             value, lo, hi = interval(p)
-            shown.append(f"{label(n, p.unit)} {value} ({lo} .. {hi}) {'' if p.unit == '1' else p.unit}".rstrip())
-        why = f"its size may be zero: {', '.join(shown)}"
+            sizes.append(f"{label(n, p.unit)} {value} ({lo} .. {hi}) {'' if p.unit == '1' else p.unit}".rstrip())
+        why = f"its size may be zero: {', '.join(sizes)}"
     factor, scaled_unit = shown_in(fit, w.output, max(w.residual_rms_without, w.residual_rms_with))
     without, within = number(w.residual_rms_without * factor), number(w.residual_rms_with * factor)
     instead = f"; {words(w.replaced_by)} is named instead" if w.replaced_by else ""
@@ -297,7 +299,7 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
 
 
 def rival_remark(ratio: float, as_good: bool, named: str) -> str:
-    """Why a rival is not named.
+    """Return why a rival is not named.
 
     ``ratio``: its held-out residual over that of ``named``; ``as_good``: a paired test finds it within the margin.
     """
