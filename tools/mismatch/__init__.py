@@ -1,4 +1,4 @@
-"""Where a simulation and a recording differ: which physics was left out, and what modelling it gains.
+"""Finds where a simulation and a recording differ, which physics the simulation lacks, and what modelling it gains.
 
 What lives here: recordings of the contract, twins, the engine that decides, reports, the blind proof, the interface for
 notebooks (``from tools.mismatch import Recording, Twin, diagnose``; the import loads numpy and no engine).

@@ -1,4 +1,4 @@
-"""From a report to a corrected twin: a ``[twin]`` table with re-fitted base parameters and the effects found."""
+"""Turns a report into a corrected twin: a ``[twin]`` table with re-fitted base parameters and the effects found."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tools.mismatch.twins.make import make
 from tools.toml_text import toml_text
 
 EVENTS = ("spikes", "step_shift", "random_walk", "dropped_samples")
-"""What happened in one recording and will not happen again at the same time: no part of a twin."""
+"""Effects that are events of one recording. They do not recur at the same time and are not part of a twin."""
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """``text`` of the twin file, its ``effects`` in order, ``notes`` on what was left out and why.
+    """Holds the ``text`` of the twin file, its ``effects`` in order, and ``notes`` on omissions with their reasons.
 
-    ``recording`` with the corrected base, ``model`` with the effects placed in it and ``theta``, its parameters.
+    ``recording`` has the corrected base, ``model`` the effects placed in it, and ``theta`` is its parameter vector.
     """
 
     kind: str
@@ -41,7 +41,7 @@ class Corrected:
 
 
 def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
-    """The twin file for a recording and the JSON report of its diagnosis.
+    """Build the twin file for a recording from the JSON report of its diagnosis.
 
     Raises InputError for a report that is not one or belongs to another recording, RecordingError for the recording.
     """
@@ -96,24 +96,24 @@ def _physics(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def check_report(recording: Recording, report: Mapping[str, Any]) -> None:
-    """InputError for what is no report of a diagnosis, or one of another recording or twin."""
+    """Raise InputError if the JSON is not the report of a diagnosis, or if it belongs to another recording or twin."""
     _physics(report)
     check_outputs(recording, report)
 
 
 def check_outputs(recording: Recording, report: Mapping[str, Any]) -> None:
-    """InputError where twin or outputs of a report are not those of a recording."""
+    """Raise InputError if twin or outputs of a report are not those of a recording."""
     if report["twin"] != recording.twin.kind:
         raise InputError(f"the report is of a {report['twin']}, {recording.path} of a {recording.twin.kind}")
     fit = report["fit"]
     outputs = set(fit.get("unit", {})) if isinstance(fit, Mapping) else set[str]()
     if outputs != set(recording.outputs):
-        said, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
-        raise InputError(f"the report's outputs ({said}) are not those of {recording.path} ({have})")
+        reported, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
+        raise InputError(f"the report's outputs ({reported}) are not those of {recording.path} ({have})")
 
 
 def report_effects(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The physics of a report as effects of a ``[twin]`` table."""
+    """Return the physics of a report as effects of a ``[twin]`` table."""
     return [_entry(p) for p in found]
 
 
@@ -123,8 +123,10 @@ def _entry(p: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, theta: np.ndarray) -> np.ndarray:
-    """Weights of effects in front of the base physics carry its input gain (``Twin.input_gain``). A twin that is
-    written down and read again may have other state coordinates, hence another gain: the effect must stay the same.
+    """Rescale the weights of effects in front of the base physics, which carry its input gain (``Twin.input_gain``).
+
+    A twin that is written and read again may have other state coordinates and hence another gain; the effect must stay
+    the same.
     """
     shifts = {b["name"]: float(b["with_effects"]) for b in report["fit"].get("base_parameters", [])}
     old = make(recording)

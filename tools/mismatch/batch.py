@@ -1,7 +1,7 @@
-"""A folder of recordings, diagnosed side by side: on this machine (joblib) or on a Dask cluster.
+"""Diagnoses a folder of recordings in parallel: on this machine (joblib) or on a Dask cluster.
 
-One recording per process, one thread in each: the work inside is many small matrices, on which several threads
-of a linear algebra library only fight for the same core.
+Each process diagnoses one recording with one thread: the work consists of many small matrices, on which several threads
+of a linear algebra library only compete for the same core.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
 
 RETRIES = 5
-"""How often a recording is tried again when the Dask worker that had it is lost."""
+"""Number of retries of a recording whose Dask worker is lost."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One recording to diagnose; ``out`` its own folder for report.json and report.html, None: write nothing."""
+    """Names a recording to diagnose; ``out`` is its own folder for report.json and report.html, None: write nothing."""
 
     name: str
     path: Path
@@ -39,8 +39,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Row:
-    """What came of one recording. ``report`` is its JSON; ``error`` says why there is none; ``bad_input`` whether
-    the recording is to blame or the engine."""
+    """Holds the outcome of a recording: ``report`` is its JSON; ``error`` says why there is none.
+
+    ``bad_input`` is True if the recording is at fault, False if the engine is.
+    """
 
     name: str
     path: str
@@ -50,7 +52,7 @@ class Row:
 
     @property
     def cells(self) -> dict[str, str]:
-        """The columns of the table: the output with the largest residual over its noise speaks."""
+        """Return the columns of the table, for the output with the largest residual over its noise."""
         if self.report is None:
             return {"name": self.name, "error": self.error}
         fit = self.report["fit"]
@@ -75,13 +77,15 @@ Work = Callable[[Job], Row]
 
 
 def is_folder_of_recordings(path: Path) -> bool:
-    """A folder without a recording.toml of its own."""
+    """Return True for a folder without a recording.toml of its own."""
     return path.is_dir() and not (path / "recording.toml").is_file()
 
 
 def find(folder: Path) -> dict[str, Path]:
-    """Recordings below a folder by name: every .toml that describes channels, or that cannot be read (it must not
-    vanish). Raises InputError when there is none."""
+    """Find the recordings below a folder, by name: every .toml that describes channels, and every unreadable one.
+
+    Unreadable files are kept so that the table reports them. Raises InputError when there is no recording.
+    """
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*.toml")):
         try:
@@ -97,7 +101,7 @@ def find(folder: Path) -> dict[str, Path]:
 
 
 def jobs_for(recordings: dict[str, Path], out: Path | None, held_out: float, seed: int) -> list[Job]:
-    """One job per recording, each with a folder of its own under ``out``."""
+    """Return a job per recording, each with a folder of its own under ``out``."""
     return [
         Job(n, p.absolute(), None if out is None else (out / n).absolute(), held_out, seed)
         for n, p in recordings.items()
@@ -105,7 +109,7 @@ def jobs_for(recordings: dict[str, Path], out: Path | None, held_out: float, see
 
 
 def diagnose_one(job: Job) -> Row:
-    """Diagnose one recording in this process and write its reports. Never raises: a bad recording is a row."""
+    """Diagnose a recording in this process and write its reports. Never raises: a bad recording becomes a row."""
     from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
@@ -125,8 +129,10 @@ def diagnose_one(job: Job) -> Row:
 
 
 def write_reports(report: Report, folder: Path, page: str | None = None) -> None:
-    """``report.json`` and ``report.html`` (``page`` if it is made already) in a folder, made if need be; both are
-    complete before either is written."""
+    """Write ``report.json`` and ``report.html`` (``page`` if given) to a folder, which is created if needed.
+
+    Both are complete before either is written.
+    """
     from tools.mismatch.report.page import html_page
     from tools.output import write_json, write_text_atomic
 
@@ -140,7 +146,7 @@ def write_reports(report: Report, folder: Path, page: str | None = None) -> None
 
 
 def run_here(jobs: Sequence[Job], processes: int, work: Work = diagnose_one) -> Iterator[Row]:
-    """Rows as they finish, from ``processes`` processes of this machine."""
+    """Yield rows as they finish, from ``processes`` processes of this machine."""
     if processes <= 1 or len(jobs) == 1:
         yield from map(work, jobs)
         return
@@ -153,9 +159,9 @@ def run_here(jobs: Sequence[Job], processes: int, work: Work = diagnose_one) -> 
 
 
 def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) -> Iterator[Row]:
-    """Rows as they finish, from the workers of a Dask cluster.
+    """Yield rows as they finish, from the workers of a Dask cluster.
 
-    They need this package and the same file system. A recording whose worker is lost goes to another one. Dask's
+    Workers need this package and the same file system. A recording whose worker is lost goes to another one. Dask's
     nanny starts workers with one thread for linear algebra (its ``pre-spawn-environ``).
     Raises InputError when the extra is missing or nobody answers at ``address``.
     """
@@ -175,7 +181,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
         }
         for future in as_completed(list(futures)):
             job = futures[future]
-            # a result that died with its worker is worked out again elsewhere: both calls wait for that
+            # a result that is lost with its worker is computed again elsewhere: both calls wait for that
             failure = future.exception()
             if failure is None:
                 yield future.result()
@@ -184,7 +190,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
 
 
 def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:
-    """Return what ``diagnose FOLDER --json`` writes."""
+    """Return the JSON that ``diagnose FOLDER --json`` writes."""
     return {
         "format": 1,
         "folder": str(folder),

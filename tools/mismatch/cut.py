@@ -1,4 +1,4 @@
-"""One stretch of a recording as a recording of its own: without gaps, on a uniform clock."""
+"""Cuts a stretch of a recording into a recording of its own: without gaps, on a uniform clock."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from tools.toml_text import toml_text
 
 @dataclass(frozen=True)
 class Stretch:
-    """What was kept: ``samples`` on a uniform clock of ``rate_hz``, from ``start_s`` to ``stop_s`` of the original;
-    ``filled`` of them stand where the original had none; ``parts``: how many stretches there were, ``kept`` of them;
-    ``segments``: the samples at which the second and later ones begin.
+    """Describes the kept stretch: ``samples`` at ``rate_hz``, from ``start_s`` to ``stop_s`` of the original.
+
+    ``filled`` samples stand where the original had none. The original had ``parts`` stretches, of which ``kept`` were
+    kept; ``segments`` are the samples at which the second and later ones begin.
     """
 
     samples: int
@@ -141,7 +142,7 @@ def cut_columns(
 
 
 def _restarts(t: Array) -> Array:
-    """Whether the clock starts anew at a sample: it jumps back by more than a gap, and does not return at once."""
+    """Return the mask of samples at which the clock restarts: it jumps back by more than a gap and does not return."""
     steps = np.diff(t, prepend=t[0])
     forward = steps[steps > 0]
     gap = LONGEST_GAP * float(np.median(forward)) if forward.size else np.inf
@@ -173,7 +174,7 @@ def resample(grid: Array, dt: float, stamps: Array, x: Array) -> Array:
 def _write(
     path: Path, text: dict[str, Any], out: Path, columns: dict[str, Array], rate_hz: float, segments: list[int]
 ) -> None:
-    """The descriptor and its data; a split in samples no longer means anything and is left out."""
+    """Write the descriptor and its data, without a split in samples, which is no longer valid."""
     out.mkdir(parents=True, exist_ok=True)
     head = {k: v for k, v in text.items() if k not in ("time_column", "split", "segments")}
     head |= {"data": "data.npz", "rate_hz": rate_hz}

@@ -30,7 +30,7 @@ from tools.mismatch.text_table import BLOCK_ROWS
 from tools.mismatch.twins.vocabulary import KINDS, vocabulary
 
 POINTS = 240
-"""Smallest and largest values of so many parts of each column are returned, for drawing."""
+"""Number of parts of each column whose smallest and largest values are returned, for drawing."""
 MOST_COLUMNS = 200
 _PART = 256
 """Rows per part of a file that is longer than one block."""
@@ -43,9 +43,9 @@ _UNNAMED = re.compile(r"^column_\d+$")
 
 @dataclass(frozen=True)
 class GuessedColumn:
-    """One column. ``unit`` is empty where nothing tells it; ``low`` and ``high`` are for drawing, [<= POINTS].
+    """Describes a column. ``unit`` is empty if unknown; ``low`` and ``high``, at most POINTS values, are for drawing.
 
-    ``missing``: values that are not finite; ``first_missing``: the sample of the first of them, or -1.
+    ``missing`` counts values that are not finite; ``first_missing`` is the sample of the first of them, or -1.
     """
 
     name: str
@@ -60,12 +60,12 @@ class GuessedColumn:
 
 @dataclass(frozen=True)
 class Guess:
-    """A proposal for a recording.
+    """Proposes a recording.
 
-    ``time_column`` is empty without one in seconds; ``rate_hz`` is None where nothing tells it. ``kind`` is empty where
-    none fits. ``unknown``: what a person has to say before it can be diagnosed; ``broken``: what has to be repaired
-    first; ``assumed``: what nothing tells and was taken for granted; ``notes``: what was left out and why. ``clock``:
-    the column of time in any unit, ``clock_unit``; ``row_of_first``: the line of the first sample of a text file, or 0.
+    ``time_column`` is empty without one in seconds; ``rate_hz`` is None if unknown. ``kind`` is empty if no twin fits.
+    ``unknown`` lists what a person must supply before a diagnosis, ``broken`` what must be repaired first, ``assumed``
+    the assumptions that nothing confirms, ``notes`` the omissions with reasons. ``clock`` is the column of time in any
+    unit, ``clock_unit``; ``row_of_first`` is the line of the first sample of a text file, or 0.
     """
 
     samples: int
@@ -84,7 +84,7 @@ class Guess:
 
 @dataclass
 class _Column:
-    """What the blocks say of one column."""
+    """Collects statistics of a column over blocks."""
 
     low: list[Array] = field(default_factory=list[Array])
     high: list[Array] = field(default_factory=list[Array])
@@ -118,8 +118,8 @@ def guess(path: Path, kind: str = "") -> Guess:
         )
     if len(names) > MOST_COLUMNS:
         raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
-    told = column_units(path)
-    parts = {k: (k, told[k]) if told.get(k) else split_unit(k) for k in names}
+    file_units = column_units(path)
+    parts = {k: (k, file_units[k]) if file_units.get(k) else split_unit(k) for k in names}
     words = words_in(path)
     notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
     row = first_line(path)
@@ -128,10 +128,10 @@ def guess(path: Path, kind: str = "") -> Guess:
         raise RecordingError(f"{path}: {n} samples; a recording needs at least {MIN_SAMPLES}")
     left = _candidates(names, parts, seen, clock, n, notes)
     if len(left) < 2:
-        said = f" ({'; '.join(notes)})" if notes else ""
+        remarks = f" ({'; '.join(notes)})" if notes else ""
         raise RecordingError(
             f"{path}: columns of numbers beside the time: {len(left)}; a recording needs one that drives and one that"
-            f" answers{said}"
+            f" answers{remarks}"
         )
     given = kind
     kinds = [kind] if kind else choose_kinds(left, parts)
@@ -193,7 +193,7 @@ def place(sample: int, row_of_first: int) -> str:
 def _scan(
     path: Path, names: list[str], parts: Parts, row: int
 ) -> tuple[dict[str, _Column], Stamps | None, str, int, list[str]]:
-    """All blocks once: what every column holds, the time stamps, their column, samples, and what was assumed."""
+    """Read all blocks once; return statistics per column, time stamps, their column, sample count and assumptions."""
     seen = {name: _Column() for name in names}
     reader: StampReader | None = None
     clock, n = "", 0
@@ -201,11 +201,11 @@ def _scan(
     for block in _slices(path, names):
         size = block[names[0]].size
         if n == 0:
-            clock, taken = _find_clock(names, parts, block)
+            clock, assumption = _find_clock(names, parts, block)
             if clock:
                 reader = StampReader(row)
-            if taken:
-                assumed.append(taken)
+            if assumption:
+                assumed.append(assumption)
         for name in names:
             seen[name].add(block[name], n, POINTS if n == 0 and size < BLOCK_ROWS else -(-size // _PART))
         if reader is not None:
@@ -222,7 +222,7 @@ def _slices(path: Path, names: list[str]) -> Iterator[dict[str, Array]]:
 
 
 def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> tuple[str, str]:
-    """The column of time, and what had to be assumed for that; both empty for none."""
+    """Find the column of time and the assumption behind the choice; both are empty without one."""
     for name in names:
         plain, unit = parts[name]
         seconds = unit != "" and units.same_dimension(unit, "s")
@@ -240,14 +240,14 @@ def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> t
 
 
 def _forward(values: Array) -> float:
-    """The share of steps that rise."""
+    """Return the share of steps that rise."""
     return float(np.mean(np.diff(values) > 0)) if values.size > 1 else 0.0
 
 
 def _candidates(
     names: Sequence[str], parts: Parts, seen: dict[str, _Column], clock: str, n: int, notes: list[str]
 ) -> list[str]:
-    """The columns that may have a role. What counts the samples or never changes has none."""
+    """Return the columns that may have a role: neither counters of samples nor constants."""
     left: list[str] = []
     for name in names:
         column = seen[name]
@@ -266,7 +266,7 @@ def _candidates(
 
 
 def _rate_beside(numbers: dict[str, float], notes: list[str]) -> float | None:
-    """The rate among single numbers of a file, by its name."""
+    """Find the rate among the single numbers of a file, by name."""
     for name, value in numbers.items():
         if value > 0 and (_RATE.match(name) or _STEP.match(name)):
             notes.append(f"'{name}' = {value:g} of the file is taken as the {'rate' if _RATE.match(name) else 'step'}")
@@ -276,19 +276,19 @@ def _rate_beside(numbers: dict[str, float], notes: list[str]) -> float | None:
 
 def _broken_clock(clock: str, stamps: Stamps) -> str:
     more = f" and {stamps.faults - len(stamps.places)} more" if stamps.faults > len(stamps.places) else ""
-    said = "; ".join(stamps.places) or f"the stamps leave an even grid by {stamps.wander:.3g} steps"
-    return f"the time in '{clock}' (usual step {stamps.step_s:.4g} s) is uneven: {said}{more}"
+    faults = "; ".join(stamps.places) or f"the stamps leave an even grid by {stamps.wander:.3g} steps"
+    return f"the time in '{clock}' (usual step {stamps.step_s:.4g} s) is uneven: {faults}{more}"
 
 
 def _no_kind(kinds: Sequence[str], left: Sequence[str], parts: Parts, found: Assignment) -> str:
     if kinds:
         return f"the twin: the columns fit a {' and a '.join(kinds)}; set its kind, or repeat with --twin KIND"
-    said = {
+    by_role = {
         role: [parts[k][1] or f"'{k}' (no unit)" for k in left if found.roles[k] == role]
         for role in ("input", "output")
     }
     return (
-        f"the twin: no kind is told by {', '.join(said['input'])} in and {', '.join(said['output'])} out;"
+        f"the twin: no kind is told by {', '.join(by_role['input'])} in and {', '.join(by_role['output'])} out;"
         f" set its kind, or repeat with --twin KIND ({', '.join(KINDS)})"
     )
 
@@ -322,7 +322,7 @@ def _drawn(column: _Column) -> tuple[list[float], list[float]]:
 
 
 def extremes(values: Array, parts: int) -> tuple[Array, Array]:
-    """The smallest and the largest values of so many parts, or of fewer where there are fewer values."""
+    """Return the smallest and the largest values of at most ``POINTS`` parts."""
     starts = np.unique(np.linspace(0, values.size, parts, endpoint=False).astype(int))
     finite = np.where(np.isfinite(values), values, np.nan)
     return np.fmin.reduceat(finite, starts), np.fmax.reduceat(finite, starts)
@@ -334,11 +334,11 @@ def as_json(found: Guess) -> dict[str, Any]:
 
 
 _COSTLY = ("fmu", "instrument")
-"""Kinds of twin that a check does not build: the one is a program, the other a whole bench."""
+"""Kinds of twin that a check does not build: a program, and a whole bench."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print a guess, or check a descriptor; exit status 2 with one message where that cannot be."""
+    """Print a guess, or check a descriptor; on failure exit with status 2 and a message."""
     parser = argparse.ArgumentParser(prog="python -m tools.mismatch.guess")
     parser.add_argument("file", type=Path)
     parser.add_argument("--check", action="store_true", help="load a descriptor instead")

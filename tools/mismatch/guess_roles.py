@@ -1,4 +1,4 @@
-"""Roles, signals and units of columns, and the kind of twin, from their names and units alone."""
+"""Guesses roles, signals and units of columns, and the kind of twin, from names and units alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SUFFIX = re.compile(
     r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
 )
 _ORDINARY_WORDS = ("in", "min", "h")
-"""Units that are words, too (``x_in``, ``x_min``): they count in brackets only."""
+"""Units that are also words (``x_in``, ``x_min``). They count as units in brackets only."""
 _WORDS: tuple[tuple[GuessedRole, str], ...] = (
     ("context", r"temp|supply|ambient|humid|status|flag|state"),
     ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
@@ -34,9 +34,9 @@ _BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
 
 @dataclass(frozen=True)
 class Assignment:
-    """What each column is. ``signals`` has those with a role; ``named``: how many of them a name or a unit told.
+    """Assigns roles and signals to columns. ``signals`` holds the columns with a role.
 
-    ``notes`` says which columns are not used, ``assumed`` which roles nothing tells.
+    ``named`` counts those that a name or a unit identified; ``notes`` lists unused columns, ``assumed`` guessed roles.
     """
 
     roles: dict[str, GuessedRole]
@@ -95,9 +95,9 @@ def choose_kinds(names: Sequence[str], parts: Parts) -> list[str]:
 
 
 def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True) -> Assignment | None:
-    """Give every column a role and a signal of a twin of ``kind``; None where an input or an output is left without.
+    """Give every column a role and a signal of a twin of ``kind``; None if no input or no output remains.
 
-    With ``by_order`` columns whose name and unit tell nothing take the places that are left, in their order.
+    With ``by_order``, columns without a telling name or unit take the free places in their order.
     """
     words = vocabulary(kind) if kind else None
     if words is None or words.open_ended:
@@ -145,7 +145,7 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
 
 
 class _Places:
-    """The signals of a closed kind, and which columns have taken them."""
+    """Maps the signals of a closed kind to the columns that occupy them."""
 
     def __init__(self, kind: str, parts: Parts) -> None:
         words = KINDS[kind]
@@ -218,19 +218,19 @@ class _Places:
 
 
 def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
-    """Roles for a twin that takes any signal: the columns' own names, or the first drives and the others answer."""
+    """Assign roles for a twin that takes any signal: by name, else the first column drives and the others answer."""
     roles: dict[str, GuessedRole] = {name: guess_role(*parts[name]) for name in names}
     used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
-    told = dict(roles)
+    named_roles = dict(roles)
     for role, name in (("input", used[0]), ("output", used[-1])):
         if role not in (roles[k] for k in used):
             free = next((k for k in (used if role == "input" else used[::-1]) if not roles[k]), name)
             roles[free] = "input" if role == "input" else "output"
     for name in used:
         roles[name] = roles[name] or "output"
-    guessed = {role: [k for k in used if roles[k] == role != told[k]] for role in ("input", "output")}
+    guessed = {role: [k for k in used if roles[k] == role != named_roles[k]] for role in ("input", "output")}
     assumed = [f"{role}s are {_quoted(of)}" for role, of in guessed.items() if of]
     signals: dict[str, str] = {}
     for name in names:
@@ -255,8 +255,8 @@ def _context_signal(plain: str, unit: str) -> str:
 
 
 def _unused(own: str, signals: Mapping[str, str]) -> str:
-    taken = set(signals.values())
-    return next(s for k in range(len(taken) + 1) if (s := own if k == 0 else f"{own}_{k + 1}") not in taken)
+    used = set(signals.values())
+    return next(s for k in range(len(used) + 1) if (s := own if k == 0 else f"{own}_{k + 1}") not in used)
 
 
 def _quoted(names: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
-"""The keys of ``recording.toml`` and of twins as tables: which there are is asked of the code that parses them.
+"""Tabulates the keys of ``recording.toml`` and of twins, as the parsers know them.
 
-A key that nobody has described in ``keys`` is listed all the same.
+A key without a description in ``keys`` is listed as well.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tools.mismatch.keys import CHANNEL, PARAMETERS, SPLIT, TOP, TWIN, Key, name
 
 
 def tables() -> Iterator[tuple[str, Sequence[Key]]]:
-    """(heading, keys) of every table of ``recording.toml`` but the twins' parameters."""
+    """Yield (heading, keys) of every table of ``recording.toml`` except the twins' parameters."""
     yield "Top of the file", listed(TOP, recording_load._TOP)
     yield "`[[channels]]`", listed(CHANNEL, recording_load._CHANNEL)
     yield "`[split]`", SPLIT
@@ -21,7 +21,7 @@ def tables() -> Iterator[tuple[str, Sequence[Key]]]:
 
 
 def of_kind(kind: str) -> Sequence[Key]:
-    """Keys of ``[twin.parameters]`` of one kind of twin, as its own module knows them."""
+    """Return the keys of ``[twin.parameters]`` of a kind of twin, as its own module knows them."""
     described = PARAMETERS.get(kind, ())
     module = {"state_space": "state_space", "mechanical_axis": "axis", "ode": "ode_text"}.get(kind)
     if module is None:
@@ -31,7 +31,7 @@ def of_kind(kind: str) -> Sequence[Key]:
 
 
 def listed(described: Sequence[Key], known: Iterable[str]) -> list[Key]:
-    """The keys that a parser knows, with what is said of them; the others of them at the end."""
+    """Return the keys that a parser knows with their descriptions; keys without one come last."""
     known = list(known)
     rest = sorted(set(known) - set(names(described)))
     free = [k for k in described if not k.name.isidentifier()]

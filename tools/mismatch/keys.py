@@ -1,4 +1,4 @@
-"""What every key of ``recording.toml`` and of each twin's parameters means."""
+"""Describes every key of ``recording.toml`` and of each twin's parameters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Key:
-    """``value``: what may stand there; ``default``: what holds where it is left out ("" if it may not be)."""
+    """Describes a key: ``value`` is its type or range, ``default`` its value if it is missing ("" if required)."""
 
     name: str
     value: str
@@ -132,9 +132,9 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
         ),
     }
 )
-"""Keys of ``[twin.parameters]`` per kind. Kinds of installed packages have their own."""
+"""Keys of ``[twin.parameters]`` per kind. Kinds of installed packages define their own."""
 
 
 def names(keys: Sequence[Key]) -> tuple[str, ...]:
-    """The names of keys, in order."""
+    """Return the names of keys, in order."""
     return tuple(key.name for key in keys)

@@ -1,4 +1,4 @@
-"""Columns of MATLAB files: versions 4 to 7, and version 7.3 (an HDF5 file) by h5py (extra ``lab``).
+"""Reads columns of MATLAB files: versions 4 to 7, and version 7.3 (an HDF5 file) by h5py (extra ``lab``).
 
 Vectors are columns, a matrix is one column per shorter dimension (``name_1``), fields of structs are ``name.field``.
 Sizes that a file claims are checked before anything is allocated.
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MOST_BYTES = 2 << 30
 MOST_DEPTH = 8
 MOST_ACROSS = 64
-"""Columns of one matrix, at most: a larger one is no table."""
+"""Largest number of columns of a matrix; a larger one is no table."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MATRIX, _COMPRESSED = 14, 15
 _STRUCT = 2
@@ -59,7 +59,7 @@ def _version_4(path: Path) -> Iterator[tuple[str, Array]]:
         raise RecordingError(f"{path}: larger than {MOST_BYTES >> 30} GiB; save fewer variables")
     try:
         content = loadmat(path)
-    except Exception as error:  # scipy raises whatever its parser stumbles upon
+    except Exception as error:  # scipy's parser may raise any exception
         raise RecordingError(
             f"{path}: not a readable MATLAB file ({type(error).__name__}: {error}); export it again"
         ) from None
@@ -69,7 +69,7 @@ def _version_4(path: Path) -> Iterator[tuple[str, Array]]:
 
 
 def _version_5(path: Path, head: bytes) -> Iterator[tuple[str, Array]]:
-    """Versions 5 to 7, read here: scipy's compiled reader ends the process where a type is damaged."""
+    """Read versions 5 to 7 without scipy, whose compiled reader ends the process where a type is damaged."""
     order = "<" if head[126:128] == b"IM" else ">"
     size, at, left = path.stat().st_size, _HEADER_BYTES, MOST_BYTES
     if size < _HEADER_BYTES:
@@ -105,11 +105,11 @@ def _version_5(path: Path, head: bytes) -> Iterator[tuple[str, Array]]:
 
 
 class _TooLargeError(Exception):
-    """More than may be unpacked."""
+    """Says that a file holds more than may be unpacked."""
 
 
 def _unpacked(body: bytes, order: str, most: int) -> bytes:
-    """The content of the one matrix in a compressed element."""
+    """Return the content of the matrix in a compressed element."""
     stream = zlib.decompressobj()
     tag = stream.decompress(body, 8)
     kind, count = struct.unpack(f"{order}II", tag)
@@ -124,11 +124,11 @@ def _unpacked(body: bytes, order: str, most: int) -> bytes:
 
 
 def _elements(body: bytes, order: str) -> Iterator[tuple[int, bytes]]:
-    """(type, data) of each part of a matrix."""
+    """Yield (type, data) of each part of a matrix."""
     at = 0
     while at + 8 <= len(body):
         first, count = struct.unpack_from(f"{order}II", body, at)
-        if first >> 16:  # up to four bytes stand in the tag itself
+        if first >> 16:  # the tag itself holds up to four bytes
             kind, count, begin, after = first & 0xFFFF, first >> 16, at + 4, at + 8
             if count > 4:
                 raise ValueError(f"a part of {count} bytes in its tag")
@@ -141,7 +141,7 @@ def _elements(body: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 
 def _matrix(body: bytes, order: str, name: str, depth: int) -> Iterator[tuple[str, Array]]:
-    """A variable as columns: numbers, and the fields of a single struct. Cells, texts and complex numbers are none."""
+    """Return a variable as columns: numbers, and the fields of a single struct, but no cells, texts or complex ones."""
     parts = _elements(body, order)
     _, flags = next(parts, (0, b""))
     if not flags:
@@ -193,7 +193,7 @@ def _hdf5(path: Path) -> Iterator[tuple[str, Array]]:
             yield from _group(file, "", 0, left)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
-    except Exception as error:  # h5py raises whatever its library stumbles upon
+    except Exception as error:  # h5py may raise any exception
         if "truncated" in str(error):
             raise RecordingError(f"{path}: torn ({error}); copy or export the file again") from None
         raise RecordingError(f"{path}: not a readable MATLAB 7.3 file ({error}); export it again") from None

@@ -1,4 +1,4 @@
-"""``micron mismatch new``: from a data file to a ``recording.toml`` and a picture of the columns."""
+"""Implements ``micron mismatch new``: a data file becomes a ``recording.toml`` and a picture of the columns."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tools.mismatch.twins.vocabulary import KINDS, user_kinds, vocabulary
 from tools.output import check_writable, save_figure, write_text_atomic
 
 CHECKED_BYTES = 64 << 20
-"""A data file up to this size is loaded before the descriptor is written; of a larger one the form is checked."""
+"""Size up to which a data file is loaded before the descriptor is written; a larger one is checked by its form."""
 _COLOURS = {"time": "#7f7f7f", "input": "#0072b2", "output": "#d55e00", "context": "#009e73", "": "#b0b0b0"}
 
 
 @dataclass(frozen=True)
 class NewRecording:
-    """What was written. ``data`` is the data file that the descriptor names; ``stretch``: what was cut or resampled."""
+    """Describes the written files. ``data`` is the descriptor's data file; ``stretch`` what was cut or resampled."""
 
     path: Path
     picture: Path
@@ -59,7 +59,7 @@ class NewRecording:
 
 
 MOST_FILLED = 0.1
-"""Share of samples on straight lines between measured ones above which the reader is told."""
+"""Share of interpolated samples above which the user is told."""
 
 
 def new_recording(
@@ -103,7 +103,7 @@ def new_recording(
 
 
 def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:
-    """Descriptor, picture and, where columns are rewritten, their file; all are free and can be written."""
+    """Return descriptor, picture and, if columns are rewritten, their file; check that all can be written."""
     if out.suffix.lower() != ".toml":
         raise InputError(f"--out {out}: name a file that ends in .toml")
     if not rewrites and data.is_file() and out.resolve().parent not in data.resolve().parents:
@@ -115,9 +115,11 @@ def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:
     if rewrites:
         npz = out.with_suffix(".npz")
         targets.append(npz if npz.resolve() != data.resolve() else out.with_name(f"{out.stem}-even.npz"))
-    there = [str(p) for p in targets if p.exists()]
-    if there and not force:
-        raise InputError(f"{', '.join(there)}: is there already; name another file with --out, or repeat with --force")
+    existing = [str(p) for p in targets if p.exists()]
+    if existing and not force:
+        raise InputError(
+            f"{', '.join(existing)}: is there already; name another file with --out, or repeat with --force"
+        )
     if any(p.resolve() == data.resolve() for p in targets):
         raise InputError(f"{data}: would be overwritten; name another file with --out")
     check_writable(*targets)
@@ -125,7 +127,7 @@ def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:
 
 
 def _needed(kind: str) -> list[str]:
-    """What a kind of twin cannot do without."""
+    """Return a message on the parameters that a kind of twin requires; empty if it requires none."""
     keys = [k.name for k in of_kind(kind) if not k.default and k.name.isidentifier()] if kind in KINDS else []
     return [f"the twin's {', '.join(keys)}: a {kind} needs them in [twin.parameters]"] if keys else []
 
@@ -143,7 +145,7 @@ def _offer(found: Guess) -> str:
 
 
 def _rewritten(data: Path, found: Guess, resample_hz: float | None) -> tuple[Stretch, dict[str, Array], Guess]:
-    """The used columns on a uniform clock, cut at gaps."""
+    """Return the used columns on a uniform clock, cut at gaps."""
     used = [c.name for c in found.columns if c.role in ("input", "output", "context")]
     read = read_columns(data, list(dict.fromkeys([*used, *([found.clock] if found.clock else [])])))
     if found.clock:
@@ -168,7 +170,7 @@ def _rewritten(data: Path, found: Guess, resample_hz: float | None) -> tuple[Str
 
 
 def _check(text: str, out: Path, data: Path, found: Guess, columns: dict[str, Array] | None) -> None:
-    """Load the descriptor as ``diagnose`` will. InputError with what the loader says."""
+    """Load the descriptor as ``diagnose`` will. Raises InputError with the loader's message."""
     if columns is None and data.stat().st_size > CHECKED_BYTES:
         columns = _stand_in(found)
     try:
@@ -178,7 +180,7 @@ def _check(text: str, out: Path, data: Path, found: Guess, columns: dict[str, Ar
 
 
 def _stand_in(found: Guess) -> dict[str, Array]:
-    """Columns of the names and the step of a large file, with other numbers."""
+    """Return synthetic columns with the names and the time step of a large file."""
     n = 1000
     return {
         c.name: np.arange(n) / (found.rate_hz or 1.0)
@@ -189,7 +191,7 @@ def _stand_in(found: Guess) -> dict[str, Array]:
 
 
 def _write(targets: Sequence[Path], text: str, found: Guess, title: str, columns: dict[str, Array] | None) -> None:
-    """The columns, the picture, and last the descriptor; what was begun is taken away where one fails."""
+    """Write the columns, the picture, and last the descriptor; on failure remove the files written so far."""
     before = [p.exists() for p in targets]
     try:
         if columns is not None:
@@ -217,15 +219,15 @@ def _save(path: Path, columns: dict[str, Array]) -> None:
 
 
 def _draw(found: Guess, title: str, path: Path) -> None:
-    """One strip per column: the smallest and largest value of each part of the file."""
+    """Draw a strip per column: the smallest and largest value of each part of the file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    shown = [c for c in found.columns if c.name != found.clock] or found.columns
-    figure = Figure(figsize=(9.0, 1.0 + 1.2 * len(shown)), dpi=100, layout="constrained")
+    drawn = [c for c in found.columns if c.name != found.clock] or found.columns
+    figure = Figure(figsize=(9.0, 1.0 + 1.2 * len(drawn)), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
-    for ax, column in zip(axes, shown, strict=True):
+    axes = figure.subplots(len(drawn), 1, squeeze=False, sharex=True)[:, 0]
+    for ax, column in zip(axes, drawn, strict=True):
         x = (np.arange(len(column.low)) + 0.5) / len(column.low) * found.samples
         low, high = np.array(column.low), np.array(column.high)
         ax.fill_between(x, low, high, color=_COLOURS[column.role], alpha=0.35, lw=0)

@@ -1,4 +1,4 @@
-"""The text of a ``recording.toml`` that was made from a guess: what is known as keys, what is not as comments."""
+"""Writes the text of a ``recording.toml`` from a guess: known facts as keys, unknown ones as comments."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def recording_text(found: Guess, source: str, data: str, stretch: Stretch | None
 def _lines(found: Guess, source: str, data: str, stretch: Stretch | None) -> Iterator[str]:
     yield f"# Guessed by 'micron mismatch new' from {source}; correct what is wrong. Keys: docs/own-data.md"
     remarks = {"Could not be known": found.unknown, "Assumed, because nothing tells it": found.assumed}
-    for heading, said in {**remarks, "Notes": found.notes}.items():
-        if said:
+    for heading, items in {**remarks, "Notes": found.notes}.items():
+        if items:
             yield f"# {heading}:"
-            for one in said:
+            for one in items:
                 yield from textwrap.wrap(one, WIDTH, initial_indent="# - ", subsequent_indent="#   ")
     yield "format = 1"
     yield f"title = {json.dumps(source)}"

@@ -1,4 +1,4 @@
-"""The engine in a notebook: recordings from arrays or files, twins from a table or any function, results to look at.
+"""Offers the engine to notebooks: recordings from arrays or files, twins from a table or any function, and results.
 
 Importing this module loads numpy and nothing larger; the engine is loaded by ``diagnose``, pandas by ``to_dataframe``,
 matplotlib by ``plot``.
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from tools.mismatch.engine.report import PhysicsFound, Report
 
 Columns = Mapping[str, str] | Iterable[str]
-"""Signals with the columns that hold them, or names that are both."""
+"""Maps signals to the columns that hold them, or lists names that are both."""
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A simulation: a ``kind`` of docs/own-data.md with its ``parameters``, or any function.
+    """Describes a simulation: a ``kind`` of docs/own-data.md with its ``parameters``, or any function.
 
     ``model`` is the kind, or ``simulate(inputs, parameters, dt)`` with each input (n,) by name, the parameters and the
     time step in s; it returns each output (n,) by name, or one array. A function runs in this process. Numbers in
@@ -46,11 +46,11 @@ class Twin:
 
     @property
     def kind(self) -> str:
-        """The kind, or the name of the function."""
+        """Return the kind, or the name of the function."""
         return self.model if isinstance(self.model, str) else getattr(self.model, "__name__", "function")
 
     def text(self) -> TwinText | None:
-        """Return the twin as the engine takes it where it is a function; None for a kind."""
+        """Return the engine's twin of a function; None for a kind."""
         if isinstance(self.model, str):
             return None
         if self.tables:
@@ -68,7 +68,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class Recording:
-    """What was measured: inputs, outputs and context, arrays (n,) by the twin's names, every ``dt`` seconds.
+    """Holds a measurement: inputs, outputs and context, arrays (n,) by the twin's names, every ``dt`` seconds.
 
     ``units`` by signal (``mm``, ``N``, ``deg/s``); a signal without one is taken in the unit of the twin. ``noise_rms``
     of an output, in its unit, where the instrument's noise is known. ``test`` is the range of samples that no fit sees
@@ -100,14 +100,14 @@ class Recording:
                 sizes[signal] = array.size
             object.__setattr__(self, part, arrays)
         if len(set(sizes.values())) > 1:
-            shown = ", ".join(f"{signal} {n}" for signal, n in sizes.items())
-            raise InputError(f"signals differ in length ({shown})")
+            lengths = ", ".join(f"{signal} {n}" for signal, n in sizes.items())
+            raise InputError(f"signals differ in length ({lengths})")
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise InputError(f"dt must be a positive number of seconds, not {self.dt}")
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:
-        """Load a recording folder or descriptor, with its own twin. Raises ``InputError`` for what is wrong with it."""
+        """Load a recording folder or descriptor with its own twin. Raises ``InputError`` if it is faulty."""
         from tools.mismatch.recording_load import load
 
         found = load(path)
@@ -155,17 +155,17 @@ class Recording:
 
     @property
     def signals(self) -> dict[str, Array]:
-        """All signals (n,), inputs first."""
+        """Return all signals, each (n,), inputs first."""
         return {s: np.asarray(x) for part in (self.inputs, self.outputs, self.context) for s, x in part.items()}
 
     @property
     def n(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return next(iter(self.signals.values())).size
 
     @property
     def t(self) -> Array:
-        """Time (n,), s, from zero."""
+        """Return the time (n,), s, from zero."""
         return np.asarray(np.arange(self.n) * self.dt, np.float64)
 
     def with_twin(self, twin: Twin | None) -> Loaded:
@@ -226,29 +226,29 @@ class Recording:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What ``diagnose`` found. ``report`` has every figure; the properties are what is asked for most."""
+    """Holds the result of ``diagnose``. ``report`` has every figure; the properties give the most used ones."""
 
     report: Report
 
     @property
     def verdict(self) -> str:
-        """``agrees``, ``recalibrate``, ``missing_physics`` or ``unexplained``."""
+        """Return the verdict: ``agrees``, ``recalibrate``, ``missing_physics`` or ``unexplained``."""
         return self.report.verdict
 
     @property
     def summary(self) -> str:
-        """The answer in words."""
+        """Return the answer in words."""
         return self.report.summary
 
     @property
     def physics(self) -> tuple[PhysicsFound, ...]:
-        """The effects that were left out of the twin, with fitted parameters and 95 % intervals."""
+        """Return the effects that the twin lacks, with fitted parameters and 95 % intervals."""
         return self.report.physics
 
     def plot(self, output: str | None = None) -> Figure:
-        """Draw an output (default: the one with most left) as measured, simulated and with physics, and the residuals.
+        """Draw an output as measured, simulated and with physics, and the residuals.
 
-        Raises ``InputError`` for an output that is not there.
+        The default is the output with the largest residual. Raises ``InputError`` for an unknown output.
         """
         from tools.mismatch.notebook_plot import plot_report
 
@@ -292,7 +292,7 @@ class Diagnosis:
         return _frame({**columns, "held_out": p.held_out}, p.t)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what ``micron mismatch diagnose --json`` writes."""
+        """Return the JSON that ``micron mismatch diagnose --json`` writes."""
         return self.report.to_json()
 
     def to_html(self) -> str:

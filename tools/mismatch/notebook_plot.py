@@ -1,4 +1,4 @@
-"""Figures for notebooks: signals over time, a diagnosis as courses and residuals."""
+"""Draws figures for notebooks: signals over time, a diagnosis as courses and residuals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLOURS = MappingProxyType({"as given": "tab:grey", "recalibrated": "tab:orange"
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows whatever backend is chosen; pyplot is not involved."""
+    """Shows itself in a notebook with any backend and without pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -42,7 +42,7 @@ def plot_signals(t: Array, signals: Mapping[str, Array], units: Mapping[str, str
 
 
 def plot_report(report: Report, output: str | None = None) -> Figure:
-    """Draw one output of a report: the courses, and below them what is left. Raises ``InputError``."""
+    """Draw an output of a report: the courses, and the residuals below them. Raises ``InputError``."""
     p, fit = report.pictures, report.fit
     if p is None:
         raise InputError("this report carries no courses to draw")

@@ -12,10 +12,11 @@ from sim_devices.physics.effect import Effect, Parameter, Parts, Settings, Stage
 
 @dataclass(frozen=True)
 class Placed:
-    """One effect at one place of the chain.
+    """Places an effect in the chain.
 
-    ``site``: where in the flow; ``target``: the input or output signal there; ``outputs``: whose residual it may
-    change (several for shared effects); ``note`` lists places that the recording cannot tell from this one.
+    ``site`` is its position in the flow; ``target`` is the input or output signal there; ``outputs`` are those whose
+    residual it may change (several for shared effects); ``note`` lists places that the recording cannot distinguish
+    from this one.
     """
 
     effect: Effect
@@ -28,18 +29,18 @@ class Placed:
 
     @property
     def parts(self) -> Parts:
-        """Its parameters."""
+        """Return the parameters of the effect."""
         return self.effect.parts(self.settings)
 
     @property
     def label(self) -> str:
-        """Name for parameter lists and logs, e.g. ``creep[displacement]``."""
+        """Return a name for parameter lists and logs, e.g. ``creep[displacement]``."""
         return f"{self.effect.name}[{self.target}]"
 
 
 @dataclass(frozen=True)
 class Free:
-    """One entry of the parameter vector."""
+    """Describes an entry of the parameter vector."""
 
     name: str
     unit: str
@@ -49,13 +50,13 @@ class Free:
     scale: float
     linear: bool
     placed: int
-    """-1 for base parameters, else the index of the placed effect."""
+    """Index of the placed effect; -1 for base parameters."""
     away: float | None = None
-    """Where it does nothing."""
+    """Value at which the parameter has no influence."""
 
 
 def middle(p: Parameter | Free) -> float:
-    """Of the bounds (geometric where searched by logarithm), or the parameter's scale when it has none."""
+    """Return the middle of the bounds (geometric if searched by logarithm), or the scale of an unbounded parameter."""
     lo, hi = p.lo, p.hi
     if p.log and lo > 0 and np.isfinite(hi):
         return float(np.sqrt(lo * hi))
@@ -65,6 +66,6 @@ def middle(p: Parameter | Free) -> float:
 
 
 def free_entry(p: Parameter, u_in: str, u_out: str, prefix: str, k: int) -> Free:
-    """The entry of parameter ``p`` of placed effect ``k`` (-1: base), its unit in those of input and output."""
+    """Return the entry of parameter ``p`` of placed effect ``k`` (-1: base), its unit in those of input and output."""
     unit = p.unit.replace("{in}", u_in).replace("{out}", u_out)
     return Free(prefix + p.name, unit, p.lo, p.hi, p.log, p.scale, False, k, p.away)

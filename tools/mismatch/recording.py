@@ -1,4 +1,4 @@
-"""A recording beside a twin: what section 1 of the contract describes, loaded, converted and checked."""
+"""Represents a recording with its twin (section 1 of the contract) after loading, conversion and checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Split:
-    """The optional ``[split]`` table: sample ranges (stop excluded) or another recording."""
+    """Holds the optional ``[split]`` table: sample ranges (stop excluded) or another recording."""
 
     fit: tuple[int, int] | Path | None = None
     test: tuple[int, int] | Path | None = None
@@ -30,7 +30,7 @@ output (n,) by name, or the array alone where there is one output."""
 
 @dataclass(frozen=True)
 class TwinText:
-    """The ``[twin]`` table: kind, the engineer's parameters, effects of a corrected twin.
+    """Holds the ``[twin]`` table: kind, the engineer's parameters, effects of a corrected twin.
 
     ``simulate`` is the twin itself where it was given as a function; its parameters ``fixed`` are not fitted.
     """
@@ -43,12 +43,12 @@ class TwinText:
 
 
 Condition = float | str
-"""What a recording was made under: a number, or a word (the name of an operator)."""
+"""Condition under which a recording was made: a number, or a word (the name of an operator)."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One of several recordings that were joined: its samples ``start`` to ``stop`` (excluded) and its conditions."""
+    """Describes one of several joined recordings: its samples ``start`` to ``stop`` (excluded) and its conditions."""
 
     name: str
     start: int
@@ -58,16 +58,15 @@ class Part:
 
 @dataclass(frozen=True)
 class Recording:
-    """All columns float64 (n,), in the contract's units, uniformly sampled.
+    """Holds all columns, float64 (n,), in the contract's units, uniformly sampled.
 
     ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
     ``tolerance``: differences of an output that do not matter to the user, in its contract unit. ``segments``: samples
-    other than the first at which a new run begins: plants with states start there afresh. ``conditions``: the table
-    ``[conditions]``, dates as days since 1970. ``parts``: the recordings that were joined to this one (none: it is
-    one); memory of effects begins afresh in each. ``per_recording``: base parameters that are free in each part;
-    ``levels``: how far each part's base parameters (parts, parameters) lay from the shared ones, where that was taken
-    off the outputs.
+    other than the first at which a new run begins: plants with states restart there. ``conditions``: the table
+    ``[conditions]``, dates as days since 1970. ``parts``: the joined recordings (empty for a single one); the memory of
+    effects restarts in each. ``per_recording``: base parameters that are free in each part; ``levels``: deviations of
+    each part's base parameters from the shared ones (parts, parameters) whose influence was removed from the outputs.
     """
 
     path: Path
@@ -94,19 +93,19 @@ class Recording:
 
     @property
     def file_unit(self) -> dict[str, str]:
-        """The unit of each signal in the data file."""
+        """Return the unit of each signal in the data file."""
         return {**self.unit, **self.declared_unit}
 
     def segments_of(self, start: int, stop: int) -> tuple[int, ...]:
-        """The segments that begin within samples ``start`` to ``stop``, counted from ``start``."""
+        """Return the segments that begin within samples ``start`` to ``stop``, counted from ``start``."""
         return tuple(s - start for s in self.segments if start < s < stop)
 
     @property
     def n(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return self.t.size
 
     @property
     def signals(self) -> dict[str, Array]:
-        """Inputs and context together: what an effect may look at."""
+        """Return inputs and context together: the signals that an effect may use."""
         return {**self.context, **self.inputs}

@@ -1,4 +1,4 @@
-"""Columns of a data file of any format, by its ending. Sizes are bounded; a fault is named with file and place."""
+"""Reads columns of a data file of any format, by its ending. Sizes are bounded; errors name file and place."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _NOT_JSON = (ValueError, RecursionError, OverflowError)
 
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
-    """The named columns as float64 (n,). Raises RecordingError."""
+    """Return the named columns, float64 (n,). Raises RecordingError."""
     columns = _format(path).read(path, names)
     lengths = {k: v.size for k, v in columns.items()}
     if len(set(lengths.values())) > 1:
-        shown = ", ".join(f"{k} {v}" for k, v in lengths.items())
-        raise RecordingError(f"{path}: columns differ in length ({shown}); every column needs one value per sample")
+        sizes = ", ".join(f"{k} {v}" for k, v in lengths.items())
+        raise RecordingError(f"{path}: columns differ in length ({sizes}); every column needs one value per sample")
     if max(lengths.values()) > MAX_SAMPLES:
         raise RecordingError(f"{path}: more than {MAX_SAMPLES} samples; cut the recording into parts")
     return columns
@@ -51,7 +51,7 @@ def read_blocks(path: Path, names: list[str]) -> Iterator[dict[str, Array]]:
 
 
 def column_names(path: Path) -> list[str]:
-    """The columns that ``read_columns`` could read from a data file. Raises RecordingError."""
+    """Return the names of the columns that ``read_columns`` can read from a data file. Raises RecordingError."""
     return _format(path).names(path)
 
 
@@ -62,18 +62,18 @@ def column_units(path: Path) -> dict[str, str]:
 
 
 def word_columns(path: Path) -> list[tuple[str, str]]:
-    """Columns of a text file that hold words, each with the first of them. Raises RecordingError."""
+    """Return the columns of a text file that hold words, each with its first word. Raises RecordingError."""
     return list(text_table.text_table(path).text) if path.suffix.lower() in text_table.SUFFIXES else []
 
 
 def first_line(path: Path) -> int:
-    """The line of the first sample of a text file; 0 for other files. Raises RecordingError."""
+    """Return the line of the first sample of a text file; 0 for other files. Raises RecordingError."""
     return text_table.text_table(path).first if path.suffix.lower() in text_table.SUFFIXES else 0
 
 
 @dataclass(frozen=True)
 class _Format:
-    """How the columns of one kind of file are listed and read, and their units, where the format has any."""
+    """Lists and reads the columns of a kind of file, with their units where the format has any."""
 
     names: Callable[[Path], list[str]]
     read: Callable[[Path, list[str]], dict[str, Array]]
@@ -135,7 +135,7 @@ def _mat(path: Path, names: list[str]) -> dict[str, Array]:
 
 
 def read_scalars(path: Path) -> dict[str, float]:
-    """Single numbers that a file holds beside its columns, such as a rate. Raises RecordingError."""
+    """Return the single numbers that a file holds beside its columns, such as a rate. Raises RecordingError."""
     suffix = path.suffix.lower()
     if suffix == ".mat":
         return {k: float(v[0]) for k, v in mat_file.read_mat(path).items() if v.size == 1}
@@ -165,9 +165,9 @@ def _mcap_names(path: Path) -> list[str]:
 
 
 def _messages(path: Path) -> Iterator[tuple[str, str, ChunkMessage]]:
-    """Topic, encoding and message, in the order of the file. Raises RecordingError.
+    """Yield topic, encoding and message, in the order of the file. Raises RecordingError.
 
-    ``mcap``'s own readers unpack whatever a chunk claims; here no size is believed (``firmware_py.recording.unpack``).
+    ``mcap``'s own readers trust the size that a chunk claims; this one does not (``firmware_py.recording.unpack``).
     """
     channels: dict[int, tuple[str, str]] = {}
     try:
@@ -215,8 +215,10 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
 
 
 def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
-    """JSON messages in order of their log time; a column is ``topic.field`` (``topic.field.0`` for list elements), or
-    ``topic.log_time_s``."""
+    """Read JSON messages in order of their log time.
+
+    A column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``.
+    """
     wanted = {n: n.rsplit(".", 1)[0] for n in names}
     found: dict[str, array[float]] = {n: array("d") for n in names}
     times: dict[str, array[int]] = {n: array("Q") for n in names}

@@ -1,4 +1,4 @@
-"""From a descriptor to a Recording: contract section 1, with every fault named."""
+"""Loads a descriptor as a Recording (contract, section 1) and names every fault."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tools.mismatch.recording_columns import SUFFIXES, column_units, read_column
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
 
 MIN_SAMPLES = 50
-MIN_SPAN = 30  # samples of a [split] range
-LONGEST_GAP = 20.0  # usual steps of a time column
+MIN_SPAN = 30  # least samples of a [split] range
+LONGEST_GAP = 20.0  # longest gap that is filled, in usual steps of a time column
 MOST_MISSING = 0.02  # of the time
 CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch without gaps"
 MOST_SIZE = 1e100  # of any value: squares must stay finite
@@ -42,9 +42,9 @@ class _Channel:
 
 
 def load(path: Path | str) -> Recording:
-    """The recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), checked and converted.
+    """Load the recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), check and convert it.
 
-    Raises RecordingError for everything that is wrong with it.
+    Raises RecordingError for any fault.
     """
     path = Path(path)
     if path.is_dir():
@@ -55,10 +55,10 @@ def load(path: Path | str) -> Recording:
 def from_table(
     path: Path, text: Mapping[str, Any], columns: Mapping[str, Array] | None = None, twin: TwinText | None = None
 ) -> Recording:
-    """The recording that a descriptor's table describes, checked and converted. ``path`` is what messages name.
+    """Build the recording that a descriptor's table describes, checked and converted. Messages name ``path``.
 
-    ``columns`` (n,) by name stand for the data file, ``twin`` for the table ``[twin]``, where they are given.
-    Raises RecordingError for everything that is wrong with it.
+    If given, ``columns`` (n,) by name replace the data file, and ``twin`` the table ``[twin]``. Raises RecordingError
+    for any fault.
     """
     where = str(path)
     if text.get("format") != 1:
@@ -164,7 +164,7 @@ def from_table(
 
 
 def descriptor(path: Path) -> dict[str, Any]:
-    """The text of a descriptor, unchecked. RecordingError when it is not there or not TOML."""
+    """Return the table of a descriptor, unchecked. Raises RecordingError if it does not exist or is not TOML."""
     return _toml(path)
 
 
@@ -188,7 +188,7 @@ def _number(where: str, key: str, value: object) -> float | None:
 
 
 def _twin_table(path: Path, value: object) -> object:
-    """The [twin] table itself, or that of the twin file which it names."""
+    """Return the [twin] table, or that of the twin file which it names."""
     if not isinstance(value, Mapping) or "file" not in value:
         return value
     name = value["file"]
@@ -204,7 +204,7 @@ def _twin_table(path: Path, value: object) -> object:
 
 
 def load_twin(path: Path) -> TwinText:
-    """The ``[twin]`` table of a twin file. RecordingError says what is wrong with it."""
+    """Return the ``[twin]`` table of a twin file. Raises RecordingError for any fault."""
     table = _toml(path).get("twin")
     if not isinstance(table, Mapping):
         raise RecordingError(f"{path}: no [twin] table; write one with 'micron mismatch apply'")
@@ -332,8 +332,9 @@ def _together(where: str, kind: str, channels: list[_Channel]) -> None:
 
 
 def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[str]) -> tuple[float, Array | None]:
-    """The step of a time column that must run forwards, and a uniform grid to bring it to where it is not uniform to
-    half a sample: few short gaps, or a clock that wanders.
+    """Return the time step of a monotonic time column, and the uniform grid to resample it to.
+
+    A grid is needed where the column is not uniform to half a sample, because of a few short gaps or a wandering clock.
     """
     d = np.diff(stamps)
     back = d <= 0
@@ -374,7 +375,7 @@ def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[
 def uniform(
     path: Path, columns: Mapping[str, Array], time_column: str | None, rate_hz: float | None
 ) -> tuple[float, dict[str, Array]]:
-    """The time step in s, and the columns (n,) at that step. Raises RecordingError for a broken time column."""
+    """Return the time step in s and the columns (n,) at that step. Raises RecordingError for a broken time column."""
     if time_column is None:
         if rate_hz is None or not 0 < rate_hz < np.inf:
             raise RecordingError(f"{path}: neither 'rate_hz' nor 'time'; give one of them")
@@ -387,7 +388,7 @@ def uniform(
 
 
 def on_grid(grid: Array, dt: float, stamps: Array, x: Array) -> Array:
-    """Per point of the grid the nearest sample (interpolation would smooth the noise); a straight line in gaps."""
+    """Take the nearest sample per grid point (interpolation would smooth the noise), and a straight line in gaps."""
     after = np.clip(np.searchsorted(stamps, grid), 1, stamps.size - 1)
     nearest = np.where(grid - stamps[after - 1] < stamps[after] - grid, after - 1, after)
     near = np.abs(stamps[nearest] - grid) <= 0.75 * dt
@@ -407,7 +408,7 @@ def _same_data(path: Path, channels: list[_Channel], columns: dict[str, Array], 
 
 
 def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initialization: int) -> None:
-    """Ranges that a fit and a score can stand on, and that do not share samples."""
+    """Check that the ranges are long enough for a fit and a score and share no samples."""
     for key, skip in (("fit", 0), ("test", initialization)):
         span = found.get(key)
         if isinstance(span, tuple) and span[1] - span[0] - skip < MIN_SPAN:
@@ -422,11 +423,11 @@ def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initializat
 
 
 APART = ("state_space", "mechanical_axis", "ode", "piezo_stack", "accelerometer", "magnetometer")
-"""Kinds of twins whose plants start afresh at a segment, or have no state."""
+"""Kinds of twins whose plants restart at a segment, or have no state."""
 
 
 def _segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> tuple[int, ...]:
-    """The samples at which further runs begin."""
+    """Return the samples at which further runs begin."""
     if value is None:
         return ()
     if not isinstance(value, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in value):
@@ -445,7 +446,7 @@ def _segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> 
 
 
 def _conditions(where: str, value: object) -> dict[str, Condition]:
-    """What the recording was made under. Dates become days since 1970; one without an offset is read as UTC."""
+    """Return the conditions of the recording. Dates become days since 1970; one without an offset is read as UTC."""
     if value is None:
         return {}
     if not isinstance(value, Mapping):

@@ -1,8 +1,8 @@
-"""In which units a state-space twin speaks: its matrices do not say, the recording does.
+"""Infers the units of a state-space twin from the recording, because its matrices do not state them.
 
-By the contract a channel in mV is one in V. But whoever identified A, B, C from a table in mV has C in mV. Both
-happen, and a factor of a thousand is no physics: per signal the reading is taken (SI, or as declared) under which the
-twin as given moves as much as the recording does.
+By the contract a channel in mV is converted to V. A user who identified A, B, C from a table in mV, however, has C in
+mV. Both happen, and a factor of a thousand is no physics: per signal, the unit (SI, or as declared) is chosen under
+which the twin as given moves as much as the recording does.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from tools.mismatch import units
 from tools.mismatch.recording import Recording
 
 SI = ("V", "m", "rad", "N", "N m", "A", "T", "m/s", "m/s^2", "rad/s", "rad/s^2", "Pa", "s", "Hz", "W", "ohm")
-MOST_INPUTS = 4  # with a choice; more are read as SI
-CLEAR = 1.1  # natural logarithm of how much better "as declared" must meet the amplitude
+MOST_INPUTS = 4  # largest number of inputs with a choice; more are read as SI
+CLEAR = 1.1  # natural logarithm of the factor by which "as declared" must match the amplitude better
 
 
 def si_unit(unit: str) -> str:
-    """The SI unit of the dimension of ``unit``, or ``unit`` itself where it is SI or has no plain SI name."""
+    """Return the SI unit of the dimension of ``unit``, or ``unit`` itself if it is SI or has no plain SI name."""
     parsed = units.parse(unit)
     if parsed.offset or parsed.dimension == units.parse("1").dimension:
         return unit
@@ -31,7 +31,7 @@ def si_unit(unit: str) -> str:
 
 
 def read_in(recording: Recording, to: dict[str, str]) -> Recording:
-    """The recording with these signals in other units of their dimension."""
+    """Return the recording with these signals in other units of their dimension."""
     if not to:
         return recording
 
@@ -53,9 +53,9 @@ def read_in(recording: Recording, to: dict[str, str]) -> Recording:
 
 
 def in_twin_units(recording: Recording) -> Recording:
-    """The recording (channels as declared) in the units that its state-space twin speaks; a note says what was chosen.
+    """Return the recording in the units of its state-space twin, with a note on the choice.
 
-    A twin that cannot be built is left to those who report it: the recording comes back as it is.
+    If the twin cannot be built, the recording is returned unchanged; a later step reports the fault.
     """
     choice = {s: si_unit(recording.unit[s]) for s in (*recording.inputs, *recording.outputs)}
     choice = {s: u for s, u in choice.items() if u != recording.unit[s]}
@@ -92,7 +92,7 @@ def in_twin_units(recording: Recording) -> Recording:
 
 
 def _amplitude_ratios(recording: Recording) -> dict[str, float]:
-    """Spread of the twin as given over that of the recording, per output."""
+    """Return the spread of the twin as given over that of the recording, per output."""
     from tools.mismatch.simulate import Model
     from tools.mismatch.simulate_view import View
     from tools.mismatch.twins.make import make

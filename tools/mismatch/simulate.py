@@ -1,4 +1,4 @@
-"""A twin with effects placed in its chain: parameters, simulation of a view, design columns for exact solving.
+"""Simulates a twin with effects placed in its chain: parameters, views, design columns for exact solving.
 
 Order of one pass: input effects by stage, base physics (with feedback effects inside), output effects by stage.
 On a static twin an additive effect sits at the output and is driven by the input of that output, so that its
@@ -29,14 +29,14 @@ from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
 START_PASSES = 2
-"""How often start states are sought anew behind effects at an output; each pass knows better what these made of it."""
+"""Number of passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """Outputs on a view as ``constant + columns @ theta[linear]`` for the nonlinear parameters given.
+    """Expresses outputs on a view as ``constant + columns @ theta[linear]`` for given nonlinear parameters.
 
-    ``columns[output]`` (m, len(linear[output])): only the parameters that this output sees.
+    ``columns[output]`` (m, len(linear[output])) has only the parameters on which this output depends.
     ``penalty`` (rows, len(model.linear)): smoothness rows over all linear parameters, in ``model.linear`` order.
     """
 
@@ -47,7 +47,7 @@ class Design:
 
 
 class Model:
-    """A twin with placed effects (kept in chain order as far as stages order them, then as given)."""
+    """Combines a twin with placed effects, which are kept in the order of the chain's stages, then as given."""
 
     def __init__(self, twin: Twin, placed: Sequence[Placed] = ()) -> None:
         self.twin = twin
@@ -90,15 +90,15 @@ class Model:
 
     @property
     def n_base(self) -> int:
-        """Number of base parameters; they come first in theta."""
+        """Return the number of base parameters; they come first in theta."""
         return len(self.twin.parameters)
 
     def slices(self, k: int) -> tuple[slice, slice]:
-        """Return where the nonlinear parameters and the weights of placed effect ``k`` sit in theta."""
+        """Return the slices of theta with the nonlinear parameters and the weights of placed effect ``k``."""
         return self._slices[k]
 
     def together(self, outputs: Sequence[str]) -> tuple[str, ...]:
-        """``outputs`` and all others that share a parameter with one of them, in the twin's order."""
+        """Return ``outputs`` and all others that share a parameter with one of them, in the twin's order."""
         if not self.twin.apart or any(p.site == "input" for p in self.placed):
             return self.twin.outputs
         found = set(outputs)
@@ -109,7 +109,7 @@ class Model:
             found |= more
 
     def parameters_of(self, outputs: Sequence[str]) -> set[int]:
-        """Indices of the parameters that move one of ``outputs``."""
+        """Return the indices of the parameters that move one of ``outputs``."""
         if set(outputs) == set(self.twin.outputs):
             return set(range(len(self.parameters)))
         m = len(self.twin.outputs)
@@ -120,8 +120,9 @@ class Model:
         return found
 
     def moved_by(self, i: int) -> tuple[str, ...]:
-        """The outputs that may change with nonlinear parameter ``i`` while the linear ones are solved again: its own
-        and all that share a linear parameter with one of them, in the twin's order.
+        """Return the outputs that may change with nonlinear parameter ``i`` while the linear ones are solved again.
+
+        These are its own outputs and all that share a linear parameter with one of them, in the twin's order.
         """
         k = self.parameters[i].placed
         if not self.twin.apart or k < 0 or self.placed[k].site != "output":
@@ -137,8 +138,10 @@ class Model:
         return tuple(o for o in self.twin.outputs if o in found)
 
     def start(self, recording: Recording) -> Array:
-        """Theta with the base as given, effects absent as far as that is expressible (weights zero, nonlinear
-        parameters in the middle of their bounds)."""
+        """Return theta with the base as given and effects absent as far as that is expressible.
+
+        Weights are zero and nonlinear parameters in the middle of their bounds.
+        """
         theta = np.zeros(len(self.parameters))
         theta[: self.n_base] = self.twin.start(recording)
         for k, pl in enumerate(self.placed):
@@ -147,20 +150,20 @@ class Model:
         return theta
 
     def carry(self, other: Model, theta: Array, recording: Recording) -> Array:
-        """Theta of ``other`` (a model with a subset of these effects) as a start for this one, by effect."""
-        mine = self.start(recording)
-        mine[: self.n_base] = theta[: other.n_base]
+        """Return the theta of ``other`` (a model with a subset of these effects) as a start for this one, by effect."""
+        start = self.start(recording)
+        start[: self.n_base] = theta[: other.n_base]
         left = list(range(len(other.placed)))
         for k, pl in enumerate(self.placed):
             hit = next((j for j in left if other.placed[j] == pl or other.placed[j] is pl), None)
             if hit is not None:
                 left.remove(hit)
                 for a, b in zip(self._slices[k], other.slices(hit), strict=True):
-                    mine[a] = theta[b]
-        return mine
+                    start[a] = theta[b]
+        return start
 
     def human(self, theta: Array) -> dict[str, list[Human]]:
-        """Parameters for the report: key "base" and each effect's label."""
+        """Return the parameters for the report, under the key "base" and each effect's label."""
         out: dict[str, list[Human]] = {"base": list(self.twin.human(theta[: self.n_base]))}
         for k, pl in enumerate(self.placed):
             a, b = self._slices[k]
@@ -182,11 +185,11 @@ class Model:
 
     @property
     def bends(self) -> bool:
-        """Whether an output is read through an effect that is not linear."""
+        """Return True if an output passes through an effect that is not linear."""
         return any(p.site == "output" and p.effect.driven and not p.effect.is_linear for p in self.placed)
 
     def base_text(self, theta: Array) -> dict[str, object]:
-        """The parameters of the twin in a twin file, with the rest that it begins at where no measurement shows it."""
+        """Return the twin's parameters for a twin file, with the initial rest position if no measurement shows it."""
         text = dict(self.twin.to_text(theta[: self.n_base]))
         if self.bends and getattr(self.twin, "at_rest", False):
             text["x0"] = [0.0] * len(np.asarray(text["A"]))
@@ -195,15 +198,15 @@ class Model:
     # -- simulation ---------------------------------------------------------------------------------
 
     def simulate(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
-        """Outputs of the twin on the view, (m,) each: free-run, no measured output but for start states.
+        """Return the outputs on the view, (m,) each, of a free run that uses measured outputs for start states only.
 
-        ``only`` these outputs (all if None).
+        ``only`` restricts the outputs (None: all).
         """
         flow = self._flow(view_run(self.twin, view), theta, True, only=only)
         return {o: view.take(s.value) for o, s in flow.items()}
 
     def whole(self, view: View, theta: Array) -> dict[str, Array]:
-        """Outputs over the whole recording (n,) from the start states that the view allows; remembered."""
+        """Return the outputs over the whole recording (n,) from the start states that the view allows; cached."""
         key = ("whole", self.key, theta.tobytes())
 
         def make() -> Array:
@@ -213,11 +216,11 @@ class Model:
         return dict(zip(self.twin.outputs, remember(view.memo, key, make), strict=True))
 
     def residual(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
-        """Measured minus simulated on the view."""
+        """Return measured minus simulated outputs on the view."""
         return {o: view.measured(o) - y for o, y in self.simulate(view, theta, only).items()}
 
     def excused(self, view: View, output: str) -> np.ndarray:
-        """(m,) bool: samples that a placed effect takes as its own events (bursts); not to be fitted or scored."""
+        """Return a mask (m,) of the samples that a placed effect claims as events; they are not fitted or scored."""
         out = np.zeros(view.recording.n, np.bool_)
         for pl in self.placed:
             if pl.effect.claims is not None and output in pl.outputs:
@@ -227,9 +230,9 @@ class Model:
     def design(
         self, view: View, theta: Array, only: Collection[str] | None = None, samples: NDArray[np.int64] | None = None
     ) -> Design:
-        """The affine structure at the nonlinear parameters of ``theta``; linear entries are ignored.
+        """Return the affine structure at the nonlinear parameters of ``theta``; linear entries are ignored.
 
-        ``only`` these outputs; at ``samples`` of the recording instead of the whole view.
+        ``only`` restricts the outputs; ``samples`` of the recording replace the whole view.
         """
         flow = self._flow(view_run(self.twin, view), theta, False, only=only)
         keep = set(self.linear)
@@ -253,12 +256,12 @@ class Model:
 
     @cached_property
     def key(self) -> tuple[object, ...]:
-        """Return what tells this model from another of the same twin."""
+        """Return a key that distinguishes this model from others of the same twin."""
         return tuple((*p.effect.form, p.site, p.target, p.outputs, _frozen(p.settings)) for p in self.placed)
 
     @cached_property
     def penalty(self) -> Array:
-        """Smoothness rows over ``self.linear``."""
+        """Return the smoothness rows over ``self.linear``."""
         rows = self.smoothness()
         others = np.ones(len(self.parameters), np.bool_)
         others[list(self.linear)] = False
@@ -266,7 +269,7 @@ class Model:
         return rows[solved][:, list(self.linear)]
 
     def smoothness(self) -> Array:
-        """Smoothness rows over all parameters, (rows, len(parameters)): those of the twin and of each effect."""
+        """Return the smoothness rows of the twin and of each effect over all parameters, (rows, len(parameters))."""
         n = len(self.parameters)
         own = getattr(self.twin, "penalty", None)
         blocks = [np.zeros((0, n))]
@@ -282,7 +285,7 @@ class Model:
     def flow(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
-        """The outputs for given inputs and further forces: this model as the base physics of another."""
+        """Return the outputs for given inputs and further forces, with this model as the base physics of another."""
         return self._flow(run, theta, join, None, inputs, forces)
 
     def _flow(
@@ -319,8 +322,9 @@ class Model:
         self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], theta: Array, join: bool,
         folded: set[int] | None,
     ) -> tuple[dict[str, Signal], dict[str, Array]]:  # fmt: skip
-        """The outputs behind their effects; and what effects that are driven by an output made of it, (n,), where the
-        states of equations start afresh from what was measured behind them.
+        """Return the outputs behind their effects, and the contributions (n,) of effects driven by an output.
+
+        The contributions are needed where states restart from outputs that were measured behind these effects.
         """
         found, change = dict(outputs), dict[str, Array]()
         inside = inside_of(self.twin)
@@ -348,7 +352,7 @@ class Model:
     def _driven(
         self, run: Run, theta: Array, join: bool, folded: set[int] | None, given: Mapping[str, Signal] | None = None
     ) -> tuple[dict[str, Signal], list[Force]]:
-        """Return what the base physics is driven by: inputs behind their effects, and forces."""
+        """Return the excitation of the base physics: inputs behind their effects, and forces."""
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
         for k in sorted(self.order, key=lambda k: self.placed[k].target == BETWEEN):
             pl = self.placed[k]
@@ -359,7 +363,7 @@ class Model:
         return inputs, [self.force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
 
     def start_states(self, view: View, theta: Array) -> Array:
-        """States (s,) at the first sample of a free run of differential equations."""
+        """Return the states (s,) at the first sample of a free run of differential equations."""
         inside = inside_of(self.twin)
         assert inside is not None
         run = view_run(self.twin, view)
@@ -375,7 +379,7 @@ class Model:
         return inside.states(run, used, theta, forces)[0][0]
 
     def force(self, k: int, theta: Array) -> Force:
-        """The placed effect ``k`` as a force inside the equations."""
+        """Return the placed effect ``k`` as a force inside the equations."""
         pl = self.placed[k]
         a, b = self._slices[k]
         return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)
@@ -452,15 +456,16 @@ class Model:
 
 
 def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:
-    """The run as measured in front of effects at its outputs, which made ``behind`` (n,) of them: start states are read
-    off that.
+    """Return the run with its outputs as they were before the effects, which contributed ``behind`` (n,).
+
+    Start states are read off these outputs.
     """
     before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
     return replace(run, measured=before, memo={k: v for k, v in run.memo.items() if k == ("about", run.starts)})
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
-    """Return what an effect sees on this run."""
+    """Return the context of an effect on this run."""
     return Context(
         run.t,
         run.dt,

@@ -1,4 +1,4 @@
-"""Says where a fit of flows between storages begins: beside the equations as they are, or in place of linear terms."""
+"""Finds starts for fits of flows between storages: beside the equations as given, or in place of linear terms."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tools.mismatch.twins.equations import rates_at
 from tools.mismatch.twins.ode import OdeTwin, inside_of
 
 FIELD_SAMPLES = 60
-"""Samples of a run at which two fields of derivatives are compared."""
+"""Number of samples of a run at which two fields of derivatives are compared."""
 
 
 def flow_starts(model: Model, k: int, view: View, theta: Array, output: str) -> list[Array]:
-    """Starts of a search for flow ``k`` of ``model``, whose levels ``theta`` holds."""
+    """Return the starts of a search for flow ``k`` of ``model``, whose levels ``theta`` holds."""
     inside = inside_of(model.twin)
     assert inside is not None
     _, b = model.slices(k)
@@ -39,7 +39,7 @@ def _bounded(model: Model, base: Array) -> Array:
 
 
 def tangent(model: Model, k: int, view: View, theta: Array, inside: OdeTwin) -> list[Array]:
-    """The start at which flow ``k`` stands in place of the linear terms that are tangent to it, at most one.
+    """Return the start at which flow ``k`` replaces the linear terms that are tangent to it; at most one.
 
     A linear model of a storage is the tangent of its law at the mean level (Schoukens and Noel 2017, section 2): the
     flow gets the slope of the linear term there, and the base parameters move so that the derivatives along the run
@@ -88,9 +88,10 @@ def tangent(model: Model, k: int, view: View, theta: Array, inside: OdeTwin) -> 
 
 
 def tried_together(model: Model, k: int, view: View, theta: Array, output: str) -> tuple[Array, Array]:
-    """Weights of flow ``k`` that meet the residual best to first order and the movement of the base parameters beside
-    them, by simulating each with a small change: its columns act on several states, so no one way to the output carries
-    them.
+    """Return the weights of flow ``k``, fitted to the residual to first order, and the shift of the base parameters.
+
+    Each is simulated with a small change, because the columns act on several states and no single path to the output
+    carries them.
     """
     _, b = model.slices(k)
     at = theta.copy()

@@ -1,4 +1,4 @@
-"""Where in a chain an effect may sit; places that a recording cannot tell apart are one place with a note."""
+"""Lists the places of an effect in a chain; places that a recording cannot distinguish are one place with a note."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DRIVES: tuple[Stage, ...] = ("amplifier", "actuator")  # stages before the base
 
 
 def sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed] = ()) -> list[Placed]:
-    """Places for ``effect``, likeliest first. Empty: this twin or recording cannot have it (see ``why_not``).
+    """Return places for ``effect``, most likely first; empty if this twin or recording cannot have it (``why_not``).
 
     ``present``: effects that are already placed; behind a nonlinear one, input and output are different places.
     """
@@ -32,7 +32,7 @@ def sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Pl
 
 
 def why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
-    """Why an effect cannot be proposed here at all, in words; "" if it can."""
+    """Return in words why an effect cannot be proposed here at all; "" if it can."""
     reasons = [_why_not(twin, recording, one) for one in (effect, *effect.variants)]
     return "" if "" in reasons else reasons[0]
 
@@ -60,14 +60,15 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
 
 
 def places_of(twin: Twin) -> tuple[Place, ...]:
-    """Where forces and flows may act inside: at each state of differential equations, or on the one equation of motion
-    that the other dynamic twins have.
+    """Return the inner places of forces and flows.
+
+    They are the states of differential equations, or the single equation of motion of the other dynamic twins.
     """
     return getattr(twin, "places", (AXIS,) if twin.feedback_on else ())
 
 
 def _acts_at(twin: Twin, effect: Effect) -> list[Place]:
-    """The places of a twin where a force or flow may act: of its kind, and of the unit that it asks for."""
+    """Return the places of a twin at which a force or flow may act: those of its kind and of the unit it requires."""
     return [
         p for p in places_of(twin) if p.kind in effect.acts_on and effect.position_unit in ("", _position_unit(twin, p))
     ]
@@ -87,16 +88,16 @@ def _stage(twin: Twin, effect: Effect) -> Stage:
 
 
 def _commutes(twin: Twin) -> bool:
-    """Return whether a linear effect before the twin is the same as behind it.
+    """Return True if a linear effect before the twin is equivalent to one behind it.
 
-    It is not where the twin's equations may be nonlinear, where each stretch starts from measured states, or where
-    nothing is known of the inside: a motor's angle keeps what its first command did to it.
+    It is not where the twin's equations may be nonlinear, where each stretch starts from measured states, or where the
+    inside is unknown: a motor's angle keeps the effect of its first command.
     """
     return not hasattr(twin, "places") and not isinstance(getattr(twin, "core", twin), OpaqueTwin)
 
 
 def _behind(twin: Twin, effect: Effect, stage: Stage) -> Stage:
-    """The first stage behind the mechanics that an effect may have in a chain, else ``stage``."""
+    """Return the first stage behind the mechanics that an effect may have in a chain, else ``stage``."""
     late: list[Stage] = [s for s in effect.stages if s in twin.chain and STAGES.index(s) > STAGES.index("mechanics")]
     return late[0] if late else stage
 
@@ -163,8 +164,10 @@ def _static(
 
 
 def _groups(twin: Twin, effect: Effect, usable: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Outputs that share one set of weights: those of one location for a position error, of one or all of them for a
-    package that is turned, else all.
+    """Return the groups of outputs that share a set of weights.
+
+    A position error is shared by the outputs of a location, a rotated package by those of one location or of all, any
+    other effect by all outputs.
     """
     if effect.name not in ("sensor_position_error", "misalignment"):
         return [usable]

@@ -1,4 +1,4 @@
-"""Where a placed effect starts: its settings and first parameters, read off the residual of the model without it."""
+"""Estimates the start of a placed effect: its settings and first parameters, from the residual without it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tools.mismatch.twins.ode import inside_of
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
-    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view.
+    """Return ``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view.
 
     An effect of several outputs that has a test of its own reads them off the output that shows it best.
     """
@@ -43,8 +43,9 @@ def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
 
 
 def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
-    """Theta with placed effect ``k`` at each of its guesses (others kept), from the residual at ``theta``
-    without effect ``k``.
+    """Return theta with placed effect ``k`` at each of its guesses, from the residual at ``theta`` without it.
+
+    The other effects keep their parameters.
     """
     pl, twin = model.placed[k], model.twin
     rest = Model(twin, [p for j, p in enumerate(model.placed) if j != k])
@@ -72,7 +73,7 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
         return out
     out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x, residual, ctx), *out]
     if not twin.static:
-        # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
+        # the re-fitted base may compensate the effect, so the engineer's own base is a start as well
         given = twin.start(view.recording)
         if not np.allclose(given, theta[: model.n_base], rtol=1e-3, atol=0.0):
             out += _from_believed(model, rest, k, view, out[:2], given)
@@ -80,7 +81,7 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
 
 
 def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequence[Array], given: Array) -> list[Array]:
-    """The same starts on the engineer's base, searched weights met anew there; ``rest``: without effect ``k``."""
+    """Return the starts on the engineer's base with weights fitted again there; ``rest`` is without effect ``k``."""
     pl = model.placed[k]
     a, b = model.slices(k)
     out: list[Array] = []
@@ -98,15 +99,15 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
 
 
 MOST_BACK = 0.7
-"""Of its value, that a parameter of the base moves at most before a search begins."""
+"""Largest move of a base parameter before a search begins, as a fraction of its value."""
 
 
 def bent_back(
     model: Model, k: int, theta: Array, guesses: Sequence[Array], x: Array, residual: Array, ctx: Context
 ) -> list[Array]:
-    """Starts at the guesses of effect ``k`` with the base where it would be beside it, to first order.
+    """Return starts at the guesses of effect ``k`` with the base at its optimum beside the effect, to first order.
 
-    Along the way from a base that was bent around the effect to both as they are, each alone makes things worse.
+    A base that compensated the effect and the effect itself must move together: each alone increases the cost.
     """
     pl = model.placed[k]
     searched = [i for i in model.nonlinear if i < model.n_base]
@@ -140,7 +141,7 @@ def bent_back(
 
 
 def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array) -> Array:
-    """Weights that meet the residual best to first order, on the recorded course of ``x``."""
+    """Return the weights that fit the residual best to first order, on the recorded course of ``x``."""
     basis = pl.effect.basis
     assert basis is not None
     columns = basis(x, ctx, q, pl.settings)
@@ -156,42 +157,41 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
 
 
 def full_residual(model: Model, view: View, theta: Array, output: str) -> Array:
-    """Measured minus simulated over the whole recording (n,), zero outside the view."""
+    """Return measured minus simulated over the whole recording (n,), zero outside the view."""
     full = view.recording.outputs[output] - model.whole(view, theta)[output]
     return np.where(view.mask, _bounded(full, view.recording.outputs[output]), 0.0)
 
 
 def _seen(model: Model, view: View, theta: Array, output: str) -> Array:
-    """Measured minus simulated everywhere (n,), what lies outside the view included: in one run, or started afresh in
-    every gap of the view for a twin that does so.
+    """Return measured minus simulated everywhere (n,), also outside the view.
+
+    The simulation is a single run, or restarts in every gap of the view for a twin that restarts.
     """
     residual = view.recording.outputs[output] - model.whole(view, theta)[output]
     gaps = tuple((a, b) for a, b in runs(~view.mask) if b - a > 2 * view.init + 16)
     if model.twin.restart and gaps:
         rest = View(view.recording, gaps, view.init)
         key = ("gaps", model.key, theta.tobytes(), output)
-        there = remember(view.memo, key, lambda: model.residual(rest, theta, (output,))[output])
+        in_gaps = remember(view.memo, key, lambda: model.residual(rest, theta, (output,))[output])
         residual = np.where(view.mask, residual, 0.0)
-        residual[rest.index] = there
+        residual[rest.index] = in_gaps
     return residual
 
 
 def _bounded(residual: Array, measured: Array) -> Array:
-    """``residual`` (n,) where the simulation stayed within reach of the recording, else zero: one that ran away (a
-    softening spring beyond its top) has nothing to say.
-    """
+    """Return ``residual`` (n,), or zero if the simulation diverged (a softening spring beyond its peak)."""
     most = 1e3 * float(np.max(np.abs(measured)))
     return np.where(np.abs(residual) <= most, residual, 0.0)
 
 
 def course(model: Model, view: View, theta: Array, output: str) -> Array:
-    """The position (n,) that forces depend on, as recorded."""
+    """Return the recorded position (n,) on which forces depend."""
     x = moved(model, view, theta, output)
     return travelled(x, view.recording.dt, model.twin.counted) if model.twin.counted else x
 
 
 def moved(model: Model, view: View, theta: Array, output: str) -> Array:
-    """What the plant itself did, as recorded (n,): measured less what the model adds behind it (a level that jumps)."""
+    """Return the recorded motion (n,) of the plant itself: measured less the model's additions behind it (steps)."""
     measured = view.recording.outputs[output]
     behind = [p for p in model.placed if p.site == "output" and p.effect.kind == "add" and output in p.outputs]
     if not behind:
@@ -203,13 +203,13 @@ def moved(model: Model, view: View, theta: Array, output: str) -> Array:
 
 
 MOST_BENDS = 4_000_000
-"""Numbers (32 MB) that the movements of the outputs with the parameters may take; more are not computed."""
+"""Largest number of values (32 MB) of the outputs' derivatives with respect to the parameters."""
 
 
 def bends(model: Model, view: View, theta: Array, output: str) -> Array | None:
-    """What the output moves with each searched parameter of the base, per unit, (n, k) by forward differences.
+    """Return the derivatives (n, k) of the output with respect to searched base parameters, by forward differences.
 
-    None where none is searched, where they would not fit, or where one is not finite.
+    Returns None if no parameter is searched, if they exceed ``MOST_BENDS`` values, or if one is not finite.
     """
     searched = [i for i in model.nonlinear if i < model.n_base]
     if not searched or len(searched) * view.recording.n * len(model.twin.outputs) > MOST_BENDS:
@@ -226,8 +226,10 @@ def bends(model: Model, view: View, theta: Array, output: str) -> Array | None:
 
 
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
-    """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
-    the view as mask, the declared noise, and the way to the output."""
+    """Return the signal (n,) on which a placed effect would act in ``model``, or that would drive it, and its context.
+
+    The context has the view as mask, the declared noise, and the path to the output.
+    """
     twin = model.twin
     run = view_run(twin, view)
     ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)

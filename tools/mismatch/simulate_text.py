@@ -1,4 +1,4 @@
-"""A model as plain text values and back: the ``[twin]`` table of a corrected twin."""
+"""Converts a model to plain values and back: the ``[twin]`` table of a corrected twin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tools.mismatch.twins.core import core
 
 
 def describe(model: Model, theta: Array) -> dict[str, Any]:
-    """The ``[twin]`` table: kind, parameters under the contract's names, one table per effect."""
+    """Return the ``[twin]`` table: kind, parameters under the contract's names, one table per effect."""
     effects: list[dict[str, Any]] = []
     for k, pl in enumerate(model.placed):
         a, b = model.slices(k)
@@ -41,9 +41,9 @@ def describe(model: Model, theta: Array) -> dict[str, Any]:
 
 
 def restore(recording: Recording) -> tuple[Model, Array]:
-    """The model that a recording's ``[twin]`` names, effects included, and its parameters.
+    """Return the model of a recording's ``[twin]``, effects included, and its parameters.
 
-    Raises RecordingError naming the effect and key that cannot be used.
+    Raises RecordingError that names the effect and key that cannot be used.
     """
     twin = core(recording)
     placed: list[Placed] = []
@@ -94,9 +94,7 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
 def _variant(
     where: str, effect: Effect, site: object, settings: Settings, given: Mapping[str, Any], equation: object
 ) -> Effect:
-    """The form of an effect: the one with this ``equation``; in files that do not say it, the one at ``site`` that has
-    these parameters.
-    """
+    """Return the form of an effect with this ``equation``, or, in files without one, by site and parameters."""
     if site not in ("input", "output", "feedback"):
         raise RecordingError(f"{where}: site must be input, output or feedback, got {site!r}")
     forms = [e for e in (effect, *effect.variants) if (e.kind == "feedback") == (site == "feedback")]

@@ -1,4 +1,4 @@
-"""Which samples of a recording are compared, and the stretch that has to be simulated for them."""
+"""Selects the samples of a recording that are compared, and the stretch that must be simulated for them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tools.mismatch.twins.base import Run, Twin
 
 @dataclass(frozen=True)
 class View:
-    """Sample ranges of a recording to compare on.
+    """Holds the sample ranges of a recording that are compared.
 
     ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
-    and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
-    ``fit``: ranges whose samples set the start states of a linear run, all of them (none: the first samples do).
-    ``afresh``: all samples of every range set its start state; the first ``init`` are still not scored: effects with a
-    memory need them.
-    ``memo`` remembers columns that do not change between calls; do not share it between processes.
+    and are not scored; ``lead`` samples before a range may help to set it (a guard gap that is never scored).
+    ``fit``: ranges of which all samples set the start states of a linear run (none: the first samples do).
+    ``afresh``: all samples of every range set its start state; the first ``init`` are still not scored, because
+    effects with a memory need them. ``memo`` caches columns that do not change between calls; do not share it between
+    processes.
     """
 
     recording: Recording
@@ -35,7 +35,7 @@ class View:
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
 
     def __getstate__(self) -> dict[str, object]:
-        """Fields without what is remembered: that is rebuilt in another process."""
+        """Return the fields without the cache, which another process rebuilds."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "memo"}
 
     def __setstate__(self, state: dict[str, object]) -> None:
@@ -43,22 +43,22 @@ class View:
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """Samples of the view, concatenated ranges, (m,)."""
+        """Return the samples of the view, concatenated ranges, (m,)."""
         return np.concatenate([np.arange(a, b) for a, b in self.ranges])
 
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
-        """(n,) samples of the recording that are in the view."""
+        """Return a mask (n,) of the samples of the recording that are in the view."""
         mask = np.zeros(self.recording.n, np.bool_)
         mask[self.index] = True
         return mask
 
     def take(self, x: Array) -> Array:
-        """``x`` (n,) on the view, (m,): contiguous ranges are copied faster than indices."""
+        """Return ``x`` (n,) on the view, (m,); contiguous ranges are copied faster than indices."""
         return np.concatenate([x[a:b] for a, b in self.ranges])
 
     def scored(self, twin: Twin) -> np.ndarray:
-        """(m,) bool: samples that count (not used to set a state)."""
+        """Return a mask (m,) of the samples that are scored (not used to set a state)."""
         if self.init == 0 and not self.fit:
             return np.ones(sum(b - a for a, b in self.ranges), np.bool_)
         out: list[np.ndarray] = []
@@ -75,8 +75,10 @@ class View:
         return np.concatenate(out)
 
     def setting(self, twin: Twin) -> NDArray[np.int64] | None:
-        """Samples that set the start states: all (``afresh``), or of a linear run those of the fit and, where a twin
-        starts every range afresh, the first ``init`` of the others. None: the first samples after each start.
+        """Return the samples that set the start states.
+
+        These are all samples (``afresh``), or for a linear run those of the fit and, where a twin restarts in every
+        range, the first ``init`` of the others. None means the first samples after each start.
         """
         if self.afresh:
             return self.index
@@ -89,22 +91,22 @@ class View:
 
     @cached_property
     def period(self) -> int:
-        """Samples after which all inputs and outputs of the recording repeat from its start on, 0 if they do not."""
+        """Return the period, in samples, of all inputs and outputs from the start on; 0 if they do not repeat."""
         rec = self.recording
         return steady_period(rec.inputs, rec.outputs, (0, *rec.segments))
 
     def measured(self, output: str) -> Array:
-        """(m,) the recorded output on the view."""
+        """Return the recorded output on the view, (m,)."""
         return self.take(self.recording.outputs[output])
 
     @staticmethod
     def whole(recording: Recording, init: int = 0) -> View:
-        """Everything."""
+        """Return the view of the whole recording."""
         return View(recording, ((0, recording.n),), init)
 
 
 def view_run(twin: Twin, view: View) -> Run:
-    """The stretch that a view needs: the whole past, since inputs before a block are known and set its memory.
+    """Return the run that a view needs: the whole past, since inputs before a block are known and set its memory.
 
     A twin that restarts does so at every range; others start at sample 0 and run through.
     """

@@ -1,4 +1,4 @@
-"""What is wrong with a column of time stamps, and where: read in blocks, with the limits of the loader."""
+"""Finds faults in a column of time stamps, read in blocks, with the limits of the loader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNEVEN = 0.5
 
 @dataclass(frozen=True)
 class Stamps:
-    """A summary of time stamps in seconds.
+    """Summarises time stamps in seconds.
 
     ``step_s``: the usual step; ``rate_hz``: None without a step. ``places``: the first ``MOST_PLACES`` faults, each
     with its sample and time; ``faults``: how many there are. ``is_usable``: the loader takes the column as it is.
@@ -33,7 +33,7 @@ class Stamps:
 
     @property
     def is_even(self) -> bool:
-        """Whether a rate says the same as the stamps."""
+        """Return True if a rate is equivalent to the stamps."""
         return self.is_usable and not self.faults and self.wander < 0.5
 
 

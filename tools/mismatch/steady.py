@@ -1,4 +1,4 @@
-"""Records in steady state: inputs that repeat from the first sample on, and outputs that do so, too."""
+"""Recognises records in steady state: inputs and outputs that repeat from the first sample on."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from tools.numbers import rms
 Array = NDArray[np.float64]
 
 REPEATS = 1e-3
-"""Largest rms difference of an input from itself one period later, over its rms: it was commanded, not measured."""
+"""Largest rms difference of a commanded input from itself one period later, over its rms."""
 OUTPUT_REPEATS = 0.05
-"""The same for an output, whose difference may hold noise."""
+"""Largest rms difference of an output from itself one period later, over its rms; it may hold noise."""
 LOUDER_AT_FIRST = 1.5
-"""Rms of that difference at the start of a stretch over the rest of it, above which a transient decays there."""
+"""Ratio of the rms of this difference at the start of a stretch to that of the rest, above which a transient decays."""
 DRIFTS = 0.3
-"""Mean of that difference over its rms, above which the output drifts or has not settled."""
+"""Ratio of the mean of this difference to its rms, above which the output drifts or has not settled."""
 EXACT = 1e-6  # of the output's rms: differences below are rounding
 
 
 def steady_period(inputs: Mapping[str, Array], outputs: Mapping[str, Array], starts: Sequence[int] = (0,)) -> int:
-    """The number of samples after which every input and output (n,) repeats, in each stretch from its first sample on.
+    """Return the number of samples after which every input and output (n,) repeats, in each stretch from its start on.
 
-    0 where there is none: an input does not repeat within a whole number of samples, or an output has a transient.
+    The result is 0 if an input does not repeat within a whole number of samples, or if an output has a transient.
     ``starts``: first samples of the stretches, in order.
     """
     moving = [x for x in inputs.values() if float(np.std(x)) > 0.0]

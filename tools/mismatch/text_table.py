@@ -1,4 +1,4 @@
-"""Tables of numbers in text files: any delimiter, decimal comma or point, with or without a header or a row of units.
+"""Reads tables of numbers in text files: any delimiter, decimal comma or point, optional header and row of units.
 
 The form is found from the first part of the file. Rows are read in blocks, so that a file may be larger than memory.
 """
@@ -34,7 +34,7 @@ _COMMENT = ("#", "%")
 
 @dataclass(frozen=True)
 class TextTable:
-    """The form of a table of numbers in a text file.
+    """Describes the form of a table of numbers in a text file.
 
     ``delimiter``: None stands for blanks. ``names``: one per column, ``column_1`` and so on without a header.
     ``units``: from a row of units below the header, else empty. ``text``: columns that hold words instead of numbers,
@@ -54,7 +54,7 @@ class TextTable:
 
     @property
     def columns(self) -> list[str]:
-        """The columns of numbers."""
+        """Return the columns of numbers."""
         words = {name for name, _ in self.text}
         return [name for name in self.names if name not in words]
 
@@ -151,13 +151,15 @@ def text_table(path: Path) -> TextTable:
         if i < len(row) and any(of_numbers) and i < width and not of_numbers[i]
         and any(c[i].lower() not in MISSING for c in last if len(c) > i)
     ]  # fmt: skip
-    said = (*row_of_units, *[""] * len(names))[: len(names)]
+    column_units = (*row_of_units, *[""] * len(names))[: len(names)]
     samples = begin < len(plain)
-    return TextTable(path, encoding, delimiter, decimal, tuple(names), said, tuple(words), first, has_header, samples)
+    return TextTable(
+        path, encoding, delimiter, decimal, tuple(names), column_units, tuple(words), first, has_header, samples
+    )
 
 
 def _head(path: Path) -> tuple[str, str, bool]:
-    """The beginning of the file as text, its encoding, and whether that is all of it."""
+    """Return the beginning of the file as text, its encoding, and True if that is the whole file."""
     try:
         with path.open("rb") as file:
             raw = file.read(HEAD_BYTES)
@@ -166,7 +168,7 @@ def _head(path: Path) -> tuple[str, str, bool]:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")) or _CONTROL.search(raw):
         raise RecordingError(f"{path}: not a UTF-8 text file (it holds control bytes); save it as UTF-8 csv")
-    # a line that the end of the part cuts is not looked at: neither is a character
+    # a line or a character that the end of the part cuts is ignored
     usable = raw if whole else raw[: raw.rfind(b"\n") + 1]
     for encoding in ("utf-8-sig", "cp1252"):
         try:
@@ -204,7 +206,7 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 def _delimiters(lines: list[str]) -> tuple[str | None, str]:
-    """The delimiter that every line has, and the decimal sign; a comma may be either."""
+    """Return the delimiter that every line has, and the decimal sign; a comma may be either."""
     for sign in "\t;|":
         if all(sign in line for line in lines):
             cells = [cell for line in lines for cell in _cells(line, sign)]
@@ -222,7 +224,7 @@ def _delimiters(lines: list[str]) -> tuple[str | None, str]:
 
 
 def _first_row(rows: list[tuple[int, list[str], str]], width: int, of_numbers: list[bool], decimal: str) -> int:
-    """The index of the first line of samples: from there upwards every line has a number where numbers belong."""
+    """Return the index of the first line of samples: every line from there on has numbers in the number columns."""
 
     def has_number(cells: list[str]) -> bool:
         return any(_is_number(cell, decimal) for cell, number in zip(cells, of_numbers, strict=False) if number)
@@ -244,7 +246,7 @@ def _first_row(rows: list[tuple[int, list[str], str]], width: int, of_numbers: l
 def _header(
     path: Path, above: list[tuple[list[str], str]], delimiter: str | None, width: int
 ) -> tuple[list[str], list[str]]:
-    """The names and the units above the first line of samples; empty without any."""
+    """Return the names and the units above the first line of samples; empty without any."""
     if not above:
         return [], []
 
@@ -267,7 +269,7 @@ def _header(
 
 
 def _are_units(cells: list[str]) -> bool:
-    """Whether a line is a row of units: each cell is a unit or empty, and at least one is a unit."""
+    """Return True if a line is a row of units: each cell is a unit or empty, and at least one is a unit."""
     for cell in cells:
         try:
             units.parse(cell.strip("[]() "))

@@ -1,4 +1,4 @@
-"""Several recordings of one system as one: found, checked against each other, joined."""
+"""Joins several recordings of a system: finds them, checks them against each other, concatenates them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ CLOSE_RATE = 1e-6
 
 
 def recordings_of(paths: Sequence[Path]) -> dict[str, Path]:
-    """The recordings that a command line names, by name: recordings, folders of them and quoted patterns, each once.
+    """Return the recordings that a command line names (recordings, folders, quoted patterns), each once, by name.
 
-    InputError where one of the paths holds none.
+    Raises InputError if a path holds no recording.
     """
     found: list[Path] = []
     for path in paths:
@@ -39,10 +39,10 @@ def recordings_of(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def load_together(paths: Sequence[Path], per_recording: Sequence[str] = ()) -> Recording:
-    """The recordings of a command line as one, each a part of it with a start and conditions of its own.
+    """Return the recordings of a command line as one, each a part of it with its own start and conditions.
 
-    RecordingError or InputError when there is only one, when two do not fit together (twin, channels, units, rate) or
-    when ``per_recording`` names what is no parameter of the twin and of no effect.
+    Raises RecordingError or InputError if there is only one, if two do not match (twin, channels, units, rate), or if
+    ``per_recording`` names no parameter of the twin or of an effect.
     """
     found = recordings_of(paths)
     if len(found) < 2:
@@ -57,7 +57,7 @@ def load_together(paths: Sequence[Path], per_recording: Sequence[str] = ()) -> R
 
 
 def _check_alike(first: Recording, other: Recording) -> None:
-    """Refuse two recordings that are not of one system; the message names both files and what differs."""
+    """Refuse two recordings of different systems; the message names both files and the difference."""
     both = f"{first.path} and {other.path} cannot be diagnosed together"
     if first.twin.kind != other.twin.kind:
         raise RecordingError(f"{both}: the twin of one is {first.twin.kind}, of the other {other.twin.kind}")
@@ -89,7 +89,7 @@ def _plain(parameters: object) -> str:
 
 
 def join(loaded: dict[str, Recording], per_recording: tuple[str, ...] = ()) -> Recording:
-    """Recordings that fit together, one behind the other; each brings its runs with it."""
+    """Return matching recordings one behind the other; each keeps its segments."""
     all_of = list(loaded.values())
     first = all_of[0]
     begins = np.cumsum([0, *(r.n for r in all_of)])

@@ -1,4 +1,4 @@
-"""Units as people write them in a recording: symbol -> dimension, factor, offset; conversion between equals."""
+"""Parses units as people write them (symbol -> dimension, factor, offset) and converts between equal dimensions."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _NONE: Dimension = (0, 0, 0, 0, 0, 0, 0)
 
 
 class UnitError(ValueError):
-    """Unknown unit, or a unit of another dimension."""
+    """Reports an unknown unit, or a unit of another dimension."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """``si = value * factor + offset``."""
+    """Defines a unit by ``si = value * factor + offset``."""
 
     text: str
     dimension: Dimension
@@ -102,9 +102,9 @@ _SUPERSCRIPTS = str.maketrans("²³⁻¹", "23-1")
 
 
 def parse(text: str) -> Unit:
-    """A unit such as ``um/V``, ``m/s^2``, ``deg/s``, ``N m``, ``mg`` (milli-gravity), ``G`` (gauss).
+    """Parse a unit such as ``um/V``, ``m/s^2``, ``deg/s``, ``N m``, ``mg`` (milli-gravity), ``G`` (gauss).
 
-    Raises UnitError naming the symbol that is unknown.
+    Raises UnitError that names the unknown symbol.
     """
     cleaned = text.strip().translate(_SUPERSCRIPTS)
     if cleaned in ("", "-"):
@@ -141,12 +141,12 @@ def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
 
 
 def same_dimension(a: str, b: str) -> bool:
-    """Return whether values in ``a`` can be converted to ``b``."""
+    """Return True if values in ``a`` can be converted to ``b``."""
     return parse(a).dimension == parse(b).dimension
 
 
 def convert(values: Array, unit: str, to: str) -> Array:
-    """Values in ``unit`` as values in ``to``. Raises UnitError if the dimensions differ."""
+    """Convert values in ``unit`` to values in ``to``. Raises UnitError if the dimensions differ."""
     a, b = parse(unit), parse(to)
     if a.dimension != b.dimension:
         raise UnitError(f"unit '{unit}' is not of the dimension of '{to}'")
@@ -156,7 +156,7 @@ def convert(values: Array, unit: str, to: str) -> Array:
 
 
 def convert_difference(value: float, unit: str, to: str) -> float:
-    """A difference (noise, resolution) in ``unit`` as a difference in ``to``: offsets do not count."""
+    """Convert a difference (noise, resolution) in ``unit`` to one in ``to``, without offsets."""
     a, b = parse(unit), parse(to)
     if a.dimension != b.dimension:
         raise UnitError(f"unit '{unit}' is not of the dimension of '{to}'")
