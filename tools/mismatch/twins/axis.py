@@ -105,8 +105,10 @@ def _number(recording: Recording, key: str, value: object) -> float | None:
 
 
 def _begin(recording: Recording, given: dict[str, float | None], sprung: bool) -> tuple[float, float, float, float]:
-    """Given values; no offset where none is named; missing mass and damping by regression on filtered derivatives
-    (state variable filter)."""
+    """Return the given values; an offset that is not named is absent.
+
+    Missing mass and damping are estimated by regression on filtered derivatives (state variable filter).
+    """
     known = {k: v for k, v in given.items() if v is not None}
     if not sprung:
         known["stiffness"] = 0.0
@@ -131,7 +133,7 @@ def _begin(recording: Recording, given: dict[str, float | None], sprung: bool) -
 
 
 def _filtered(u: Array, y: Array, velocity: bool, dt: float) -> Array:
-    """Columns acceleration, velocity, position, -1, force, all through the same third-order low-pass."""
+    """Return the columns acceleration, velocity, position, -1 and force, all filtered by a third-order low-pass."""
     spectrum = np.abs(np.fft.rfft(u - u.mean())) ** 2
     cut = np.searchsorted(np.cumsum(spectrum), 0.98 * spectrum.sum())
     corner = 2 * np.pi * min(max(cut / (u.size * dt), 5 / (u.size * dt)), 0.1 / dt)

@@ -1,8 +1,8 @@
-"""Two linear filters in a row, so that effects can sit between them (Wiener-Hammerstein structures).
+"""Represents a twin as two linear filters in series with a place for effects between them (Wiener-Hammerstein).
 
-A state-space twin of one input and one output says nothing about where in its chain a curve would sit: any split of its
-poles and zeros into a first and a second filter is the same twin. Written as two filters it is the same as long as
-nothing stands between them. The gain of the first filter is fixed: only the product of both gains shows.
+A state-space twin of one input and one output does not determine the place of a curve in its chain: any split of its
+poles and zeros into a first and a second filter gives the same twin, as long as nothing stands between them. The gain
+of the first filter is fixed, because only the product of both gains is observable.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class CascadeTwin(Head):
         return np.concatenate([self.second.begin, self.first.begin[list(self.free)]])
 
     def first_theta(self, theta: Array) -> Array:
-        """Parameters of the first filter, those that are fixed included."""
+        """Return the parameters of the first filter, including fixed ones."""
         out = self.first.begin.copy()
         n = len(self.second.parameters)
         out[list(self.free)] = theta[n : n + len(self.free)]
         return out
 
     def second_theta(self, theta: Array) -> Array:
-        """Parameters of the second filter: those of the first and of effects come behind them."""
+        """Return the parameters of the second filter; those of the first filter and of effects follow them."""
         return theta[: len(self.second.parameters)]
 
     def drive(self, output: str) -> str:
@@ -74,7 +74,7 @@ class CascadeTwin(Head):
         return self.second.input_gain(BETWEEN, self.second_theta(theta)) if signal == BETWEEN else 1.0
 
     def between(self, run: Run, drive: Signal, theta: Array) -> Signal:
-        """The signal between the filters for the input ``drive``; the first filter is at rest before the record."""
+        """Return the signal between the filters for the input ``drive``; the first filter starts at rest."""
         u = fold(drive, theta)
         own = self.first_theta(theta)
         value = remember(run.memo, ("between", own.tobytes(), u.token), lambda: self._first(run, u.value, own))
@@ -132,9 +132,9 @@ def between_of(twin: object) -> str:
 
 
 def cascade_twin(recording: Recording, build: Callable[[Recording], DynamicTwin]) -> CascadeTwin:
-    """The twin of a recording whose state-space table has a ``first`` filter in front; ``build`` makes each filter.
+    """Build the twin of a recording whose state-space table has a ``first`` filter; ``build`` makes each filter.
 
-    Raises RecordingError for more than one input or output, and where the first filter's table is not one.
+    Raises RecordingError for more than one input or output, and if the first filter's entry is not a table.
     """
     where = f"{recording.path}: [twin.parameters] first"
     if len(recording.inputs) != 1 or len(recording.outputs) != 1:

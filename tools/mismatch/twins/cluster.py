@@ -93,7 +93,7 @@ class ClusterTwin(ScaledOutputs):
 
 @dataclass(frozen=True)
 class _Given(ClusterTwin):
-    """A cluster whose bias and scale were fitted before (a corrected twin)."""
+    """Represents a cluster whose bias and scale were fitted before (a corrected twin)."""
 
     begin: tuple[float, ...] = ()
 
@@ -103,14 +103,14 @@ class _Given(ClusterTwin):
 
 
 def location(output: str) -> str:
-    """``accel_3y`` -> ``3``."""
+    """Return the location of an output: ``accel_3y`` -> ``3``."""
     match = re.fullmatch(r"accel_(\w*)[xyz]", output)
     assert match is not None
     return match[1]
 
 
 def cluster_twin(recording: Recording) -> ClusterTwin:
-    """The twin of a recording; positions of locations that are not given are taken as the body origin."""
+    """Build the twin of a recording; locations without a given position are at the body origin."""
     text = recording.twin.parameters
     where = f"{recording.path}: [twin.parameters]"
     for key in text:

@@ -1,4 +1,4 @@
-"""Columns of simulated output as a twin: what some other program worked out, and nothing of how."""
+"""Makes a twin of columns of simulated output that another program computed."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ NAMES = ("offset", "scale")
 
 
 def columns_twin(recording: Recording) -> StaticTwin:
-    """Each output beside the input ``simulated_OUTPUT``, which holds its simulated course. Raises RecordingError.
+    """Build a twin whose outputs follow the inputs ``simulated_OUTPUT``. Raises RecordingError.
 
-    What may be re-fitted is an offset (0 by default) and a scale (1) of each column.
+    The offset (0 by default) and the scale (1) of each column may be re-fitted.
     """
     where = f"{recording.path}: [twin]"
     text = recording.twin.parameters

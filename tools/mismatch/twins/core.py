@@ -1,4 +1,4 @@
-"""From the ``[twin]`` table to a twin without the effects of a corrected one."""
+"""Builds a twin from the ``[twin]`` table, without the effects of a corrected one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from tools.mismatch.twins.vocabulary import user_kinds
 
 
 def core(recording: Recording) -> Twin:
-    """The twin as if it had no effects (``simulate_text.restore`` adds those). Unknown kinds and parameters are
-    RecordingErrors."""
+    """Build the twin without effects, which ``simulate_text.restore`` adds.
+
+    Raises RecordingError for unknown kinds and parameters.
+    """
     kind = recording.twin.kind
     if recording.twin.simulate is not None:
         return function_twin(recording, recording.twin.simulate)

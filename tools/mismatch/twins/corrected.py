@@ -1,9 +1,9 @@
-"""A corrected twin: base physics with effects that an earlier diagnosis found, as one twin.
+"""Combines base physics with effects that an earlier diagnosis found into a corrected twin.
 
-The engine sees an ordinary twin with more base parameters, so that effects that are known already are re-fitted
-like a gain is (verdict ``recalibrate``) and are not found a second time. The weights of an effect that is made of
-many elements (hysteresis, creep) are re-fitted by one common factor: a new recording need not excite each of them.
-Additions from outside (hum, warm-up) keep free weights: their phase and level belong to the recording.
+The engine sees an ordinary twin with more base parameters, so that known effects are re-fitted as a gain is (verdict
+``recalibrate``) and are not found a second time. The weights of an effect with many elements (hysteresis, creep) are
+re-fitted by a common factor, because a new recording need not excite each of them. Additions from outside (hum,
+warm-up) keep free weights: their phase and level belong to the recording.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, Twin, fold
 from tools.mismatch.twins.head import Head
 
-MOST_FREE = 3  # weights of an effect that are re-fitted one by one
+MOST_FREE = 3  # largest number of weights of an effect that are re-fitted one by one
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class CorrectedTwin(Head):
 
     @property
     def core(self) -> Twin:
-        """The twin without its effects."""
+        """Return the twin without its effects."""
         return self.inner.twin
 
     def __getattr__(self, name: str) -> object:
-        # what only some cores have (the fastest rate of a dynamic one); never the dataclass' own fields, which
-        # pickle asks for before they are there
+        # attributes of some cores only (the fastest rate of a dynamic one); never the dataclass' own fields, which
+        # pickle requests before they exist
         if name.startswith("_") or name in CorrectedTwin.__dataclass_fields__:
             raise AttributeError(name)
         return getattr(self.inner.twin, name)
@@ -63,7 +63,7 @@ class CorrectedTwin(Head):
         return out
 
     def inside(self, theta: Array) -> Array:
-        """Theta of the inner model for parameters of this twin (further ones are ignored)."""
+        """Return theta of the inner model for parameters of this twin (further ones are ignored)."""
         moved = theta[list(self.of)]
         return np.where(self.factor, moved * np.array(self.found), moved)
 
@@ -125,7 +125,7 @@ class CorrectedTwin(Head):
 
 
 def corrected_twin(recording: Recording) -> CorrectedTwin:
-    """The twin of a recording whose ``[twin]`` lists effects. Raises RecordingError for what does not fit."""
+    """Build the twin of a recording whose ``[twin]`` lists effects. Raises RecordingError if they do not match it."""
     model, theta = restore(recording)
     for i, placed in enumerate(model.placed):
         missing = [s for s in placed.effect.needs if s not in recording.signals]
@@ -139,7 +139,7 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
     of: list[int] = []
     factor: list[bool] = []
     banks = [model.slices(k)[1] for k in range(len(model.placed))]
-    # a step that suits the size that the weights have; their unit says nothing about it
+    # the step is proportional to the size of the weights, because their unit does not determine it
     step = {j: 0.02 * float(np.max(np.abs(theta[w]))) for w in banks for j in range(w.start, w.stop)}
     common = {
         j: w.start

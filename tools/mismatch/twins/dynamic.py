@@ -1,4 +1,4 @@
-"""What mechanical axes and state-space twins share: linear response, columns, start states, feedback forces."""
+"""Implements the common part of mechanical axes and state-space twins: response, columns, start states, forces."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from tools.mismatch.twins.linear import (
 
 CONSTANT = ""  # the input "1"
 MOST_SUBSTEPS = 24
-LEAST_WINDOW = 20  # samples that set a state when nothing else is said
+LEAST_WINDOW = 20  # default number of samples that set a state
 
 
 @dataclass(frozen=True)
 class Link:
-    """Linear parameter ``j`` times state ``row`` of the companion driven by ``source`` adds to ``output``.
+    """Adds linear parameter ``j`` times state ``row`` of the companion driven by ``source`` to ``output``.
 
     ``row`` -1: the input itself; ``source`` "" with row -2: a constant offset of the output.
     """
@@ -45,10 +45,10 @@ class Link:
 
 @dataclass(frozen=True)
 class Plant:
-    """Continuous (or discrete) ``x' = a x + b w`` at given nonlinear parameters.
+    """Holds a continuous (or discrete) ``x' = a x + b w`` at given nonlinear parameters.
 
-    ``blocks``: first row and last row + 1 of each block of a block-diagonal ``a``; empty where ``a`` is one block.
-    Blocks run by themselves: one that stays as it was is not run again.
+    ``blocks``: first row and last row + 1 of each block of a block-diagonal ``a``; empty if ``a`` is one block.
+    Blocks run separately: an unchanged one is not run again.
     """
 
     a: Array
@@ -57,13 +57,13 @@ class Plant:
 
     @property
     def parts(self) -> tuple[tuple[int, int], ...]:
-        """The blocks, one where none are named."""
+        """Return the blocks; a single one if none are named."""
         return self.blocks or ((0, self.a.shape[0]),)
 
 
 @dataclass(frozen=True)
 class DynamicTwin(Head):
-    """Common part; ``plant_of(theta)`` builds the plant from the nonlinear base parameters.
+    """Implements a dynamic twin; ``plant_of(theta)`` builds the plant from the nonlinear base parameters.
 
     ``groups``: outputs that share one state, with their state rows (one of each block). ``fixed_free(n)`` is the
     response to the engineer's own start state, used when no sample may set it; ``start_given``: the engineer gave one.
@@ -85,7 +85,7 @@ class DynamicTwin(Head):
     counted: Counted = ""
     start_given: bool = False
     at_rest: bool = False
-    """Whether the start that was given is zero."""
+    """True if the given start state is zero."""
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -100,7 +100,7 @@ class DynamicTwin(Head):
         return {UNCENTRED: (1.0,)} if self.counted == "start" else {}
 
     def sensitivity(self, output: str, theta: Array) -> float:
-        """See Twin: the gain that weights of input and feedback effects carry."""
+        """See Twin: this is the gain that weights of input and feedback effects carry."""
         return self.input_gain(self.inputs[0], theta)
 
     def input_gain(self, signal: str, theta: Array) -> float:
@@ -236,7 +236,7 @@ class DynamicTwin(Head):
         columns: dict[int, dict[str, Array]],
         token: tuple[object, ...],
     ) -> dict[str, Signal]:
-        """Add the free response of the start states: the engineer's, or what the first samples say."""
+        """Add the free response of the start states: the engineer's, or those that the first samples determine."""
         n = run.t.size
         zero = np.zeros(n)
         given = self.start_given or (run.window == 0 and not run.period)
@@ -248,21 +248,21 @@ class DynamicTwin(Head):
             for group in self.groups:
                 # a value and its columns are settled alike: the start state is an affine function of them
                 ss = self._start_state(run, ad, blocks, group)
-                mine = {o: value[o] for o in group}
+                group_values = {o: value[o] for o in group}
                 x0 = (
-                    ss.steady(mine, run.period)
+                    ss.steady(group_values, run.period)
                     if run.period
-                    else ss.states({o: run.measured[o] - mine[o] for o in mine})
+                    else ss.states({o: run.measured[o] - group_values[o] for o in group_values})
                 )
                 for o in group:
                     value[o] = ss.added(value[o].copy(), x0, o)
                 for entry in columns.values():
                     if not any(o in entry for o in group):
                         continue
-                    mine = {o: entry.get(o, zero) for o in group}
-                    x0 = ss.steady(mine, run.period) if run.period else -ss.states(mine)
+                    group_values = {o: entry.get(o, zero) for o in group}
+                    x0 = ss.steady(group_values, run.period) if run.period else -ss.states(group_values)
                     for o in group:
-                        # a column may be one that is remembered
+                        # a copy, because the column may be cached
                         entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
         return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}, (*token, o)) for o in self.outputs}
 
@@ -281,9 +281,10 @@ class DynamicTwin(Head):
         )  # fmt: skip
 
     def _substeps(self, run: Run, packed: Rows, push: float) -> int:
-        """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (powers of two, so
-        that they seldom change while a fit moves; ``push``: acceleration per unit of force), eight to a period of
-        cogging.
+        """Return the steps per sample, a power of two so that it seldom changes during a fit.
+
+        There are four steps per radian of the fastest mode, two per radian of the stiffest memory and eight per period
+        of cogging. ``push`` is the acceleration per unit of force.
         """
         sub = int(np.ceil(run.dt * (packed.fastest_per_s or self.fastest_per_s) / 0.25))
         springs = float(np.sum(np.abs(packed.memory))) + max(float(packed.friction[5]), 0.0)
@@ -336,7 +337,7 @@ class DynamicTwin(Head):
         sub = 1
         if forces and self.hold != "discrete":
             push = float(cp @ plant.a @ plant.b) or 1.0
-            # bristles stiffer than the finest step can carry are as good as rigid
+            # bristles too stiff for the finest step count as rigid
             packed.friction[5] = min(packed.friction[5], (0.7 * MOST_SUBSTEPS / run.dt) ** 2 / abs(push))
             sub = self._substeps(run, packed, push)
         d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
@@ -365,7 +366,7 @@ class DynamicTwin(Head):
             and run.starts == (0,)
             and (self.start_given or (run.window == 0 and not run.period))
         ):
-            # forces make the start state no linear function of what was measured: the engineer's own stands
+            # with forces, the start state is no linear function of the measurement: the engineer's own is used
             free = self.fixed_free(run.t.size)
             x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
@@ -380,7 +381,7 @@ class DynamicTwin(Head):
             if begin is not None:
                 x = go(begin, u, starts, ends)
                 return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
-        # what sets the state is simulated alone, one window after the other
+        # the windows that set the state are simulated alone, one after the other
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
         after = np.cumsum(stop - starts)
@@ -399,16 +400,16 @@ class DynamicTwin(Head):
 Go = Callable[[Array, Array, NDArray[np.int64], NDArray[np.int64]], Array]
 MOST_SHOTS = 12
 REPEATS = 1e-9
-"""Change of a state over a period, relative to the largest state, at which it repeats."""
+"""Change of a state over a period, relative to the largest state, below which it repeats."""
 NEARLY = 1e-3
-"""The same where shooting may end without it."""
+"""Change of a state over a period, relative to the largest state, that is accepted when shooting ends early."""
 
 
 def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: NDArray[np.int64], period: int) -> Array | None:
-    """Start states (starts, s) that a run leads back to after ``period`` samples, by shooting from ``x0``.
+    """Find start states (starts, s) to which a run returns after ``period`` samples, by shooting from ``x0``.
 
-    ``go(x0, u, starts, stops)``: states (n, s); ``full`` (s, s): the linear plant over one period, in place of the
-    slopes of what is added to it. None where that leads nowhere: a plant that integrates, or a memory that does not
+    ``go(x0, u, starts, stops)`` returns states (n, s); ``full`` (s, s) is the linear plant over a period, which
+    approximates the Jacobian. Returns None without convergence: for an integrating plant, or a memory that does not
     repeat.
     """
     stop = np.asarray((np.arange(starts.size) + 1) * (period + 1), np.int64)
@@ -429,12 +430,12 @@ def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: NDArray[np.
 
 
 def discretise_blocks(plant: Plant, dt: float, hold: Hold) -> list[Discrete]:
-    """The difference equation of every block."""
+    """Return the difference equation of every block."""
     return [discretise(np.ascontiguousarray(plant.a[a:b, a:b]), plant.b[a:b], dt, hold) for a, b in plant.parts]
 
 
 def _whole(d: Sequence[Discrete], plant: Plant) -> Array:
-    """The transition matrix (s, s) of all blocks."""
+    """Return the transition matrix (s, s) of all blocks."""
     if len(d) == 1:
         return d[0].ad
     ad = np.zeros(plant.a.shape)

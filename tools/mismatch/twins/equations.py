@@ -1,4 +1,4 @@
-"""Differential equations as data: derivatives, outputs, the forces inside them, and their linearisation."""
+"""Represents differential equations as data: derivatives, outputs, the forces inside them, their linearisation."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from tools.guest.equations import Program
 from tools.mismatch.twins.feedback import Rows
 from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
 
-LEAST_SHOWN = 3e-4  # of the best determined combination of start states: what shows less keeps its guess
+LEAST_SHOWN = 3e-4  # least singular value of a fitted combination of start states, relative to the largest
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a force or flow may act. ``position``, ``velocity``, ``target``: indices of states; of a storage (a level,
-    a current, a temperature) all three are that state. ``name``: the state whose derivative the force is added to.
+    """Describes a place at which a force or flow may act.
+
+    ``position``, ``velocity`` and ``target`` are indices of states; for a storage (a level, a current, a temperature)
+    all three are that state. ``name`` is the state whose derivative the force is added to.
     """
 
     name: str
@@ -31,14 +33,14 @@ class Place:
     velocity: int
     target: int
     unit: str
-    """Of the position, or of what is stored."""
+    """Unit of the position, or of the stored quantity."""
     pairs: tuple[float, ...] = ()
-    """Of a storage: see ``flows.PAIRS``. Of a parameter: its register and that of the signal which it may follow."""
+    """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of the signal that it may follow."""
 
 
 @dataclass(frozen=True)
 class Inside:
-    """Forces and flows of one run, packed for the compiled loop (``ode_run.run_equations``)."""
+    """Packs forces and flows of a run for the compiled loop (``ode_run.run_equations``)."""
 
     place: NDArray[np.int64]
     rows: tuple[Rows, ...]
@@ -48,7 +50,7 @@ class Inside:
 
     @cached_property
     def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:
-        """friction, spring, cogging, counts, thresholds, memory."""
+        """Return friction, spring, cogging, counts, thresholds and memory."""
         rows = self.rows
 
         def join(parts: list[Array]) -> Array:
@@ -68,32 +70,32 @@ NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((
 
 
 class Equations(Protocol):
-    """Derivatives and outputs of a model, however they are worked out."""
+    """Defines the derivatives and outputs of a model, independent of how they are computed."""
 
     def states(
         self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
         times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
     ) -> Array:  # fmt: skip
-        """States (n, s) in free run; ``times`` (n,): seconds; ``values``: parameters."""
+        """Return the states (n, s) of a free run; ``times`` (n,) in seconds; ``values`` are the parameters."""
         ...
 
     def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
-        """Outputs (n, q)."""
+        """Return the outputs (n, q)."""
         ...
 
     def rates(self, x: Array, u: Array, values: Array) -> Array:
-        """Derivatives (s,) at one instant, at time zero, without forces."""
+        """Return the derivatives (s,) at time zero, without forces."""
         ...
 
 
 @dataclass(frozen=True)
 class Programs:
-    """Equations that are data (``program.py``), compiled once for all."""
+    """Runs equations that are data (``program.py``); the loop is compiled once for all of them."""
 
     rates_program: Program
     outputs: Program
     at: int
-    """Register of the first parameter."""
+    """Index of the register of the first parameter."""
 
     def states(
         self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
@@ -125,7 +127,7 @@ class Programs:
 
 @dataclass(frozen=True)
 class State:
-    """A state: unit, where it starts (a guess that the recording improves), and what it cannot leave."""
+    """Describes a state: its unit, its start (a guess that the recording improves), and its limits."""
 
     name: str
     unit: str
@@ -136,7 +138,7 @@ class State:
 
 @dataclass(frozen=True)
 class Linearised:
-    """``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
+    """Holds ``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
 
     a: Array
     b: Array
@@ -144,7 +146,7 @@ class Linearised:
 
 
 def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: Array) -> Linearised:
-    """Derivatives of the right-hand side and of the outputs, by central differences about ``x`` (s,) and ``u`` (m,)."""
+    """Linearise right-hand side and outputs by central differences about ``x`` (s,) and ``u`` (m,)."""
     step = 1e-5 * typical
     width = 1e-5 * np.maximum(np.abs(u), 1e-3)
     move = np.concatenate([step, width])
@@ -155,14 +157,14 @@ def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: 
     y = equations.readings(np.ascontiguousarray(at[:, :s]), np.ascontiguousarray(at[:, s:]), np.zeros(len(at)), values)
     half = move.size
     slope = (f[:half] - f[half:]).T / (2 * move)
-    # what is left of digits that cancel
+    # rounding errors after cancellation
     slope[np.abs(slope) < 1e-9 * np.max(np.abs(f), axis=0)[:, None] / move] = 0.0
     reading = (y[:half] - y[half:]).T / (2 * move)
     return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]))
 
 
 def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
-    """Derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
+    """Return the derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
     return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
 
 
@@ -175,10 +177,10 @@ def meet_start(
     limits: tuple[Array, Array],
     rounds: int = 3,
 ) -> Array:
-    """Start states (starts, s) that leave least of ``misses`` (rows, q), from ``x0`` on.
+    """Fit start states (starts, s) that minimise ``misses`` (rows, q), from ``x0`` on.
 
-    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton; what
-    the samples do not show stays at the guess.
+    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton are
+    made; combinations that the samples do not determine stay at the guess.
     """
     s, step = x0.shape[1], 1e-4
     first = np.searchsorted(rows, np.arange(x0.shape[0]))
@@ -193,9 +195,9 @@ def meet_start(
         cross = together(np.einsum("rqi,rq->ri", slopes, best))
         whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
         size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
-        shown = size > LEAST_SHOWN**2 * size[:, -1:]
+        determined = size > LEAST_SHOWN**2 * size[:, -1:]
         along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
-        turn = np.einsum("kij,kj->ki", ways, np.where(shown, along / np.where(shown, size, 1.0), 0.0))
+        turn = np.einsum("kij,kj->ki", ways, np.where(determined, along / np.where(determined, size, 1.0), 0.0))
         moved = np.clip(x0 + typical * turn, *limits)
         after = misses(moved)
         was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
@@ -203,7 +205,7 @@ def meet_start(
         foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
         x0 = np.where(better[:, None], moved, x0)
         best = np.where(better[rows][:, None], after, best)
-        # where equations are linear nothing is left to gain after one step
+        # linear equations need a single step
         if not np.any(better & (now < 0.999 * was) & (now > foretold + 0.001 * was)):
             break
     return x0

@@ -1,4 +1,4 @@
-"""A linear plant with forces that depend on its own position and velocity, integrated in free run."""
+"""Integrates a linear plant with forces that depend on its own position and velocity, in free run."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after,
 from tools.mismatch.twins.base import Force
 
 FASTEST = "fastest_per_s"
-"""Setting of a placed force: rate of the fastest mode of the twin that it was fitted in. Steps follow that rate, so
-that a corrected twin, whose own modes are others, is integrated like the fit that it comes from."""
+"""Name of a setting of a placed force: the rate of the fastest mode of the twin in which it was fitted. The time step
+follows that rate, so that a corrected twin, whose own modes differ, is integrated like the original fit."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Packed parameters of all feedback effects of a model; ``fastest_per_s``: see ``FASTEST``, 0 where it is not
-    known.
-    """
+    """Packs the parameters of all feedback effects of a model; ``fastest_per_s``: see ``FASTEST``, 0 if unknown."""
 
     friction: Array
     spring: Array
@@ -32,12 +30,12 @@ class Rows:
 
 
 def fastest_of(forces: Sequence[Force]) -> float:
-    """The largest of the rates that forces were fitted with (1/s), 0 where none says."""
+    """Return the largest of the rates with which forces were fitted (1/s), 0 if none states it."""
     return max((f.settings[FASTEST][0] for f in forces if FASTEST in f.settings), default=0.0)
 
 
 def pack(forces: Sequence[Force]) -> Rows:
-    """The sum of the placed effects, each through its own ``fill`` of the packed rows."""
+    """Sum the placed effects, each by its own ``fill`` of the packed rows."""
     friction, spring, cogging = np.zeros(FRICTION), np.zeros(SPRING), np.zeros(COGGING)
     thresholds: list[Array] = []
     memory: list[Array] = []
@@ -76,14 +74,13 @@ def pack(forces: Sequence[Force]) -> Rows:
 def run_feedback(
     ad, g0, g1, cp, cv, u, held, sub, step_s, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
 ):
-    """States (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
+    """Return states (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
 
-    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces and memory run linearly over
-    the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it takes from the
-    velocity what its limit allows, and no more than brings it to rest (time stepping; Acary, Brogliato, Numerical
-    Methods for Nonsmooth Dynamical Systems, 2008, section 1.4). Behind bristles (``friction[5]`` > 0) it is the LuGre
-    model instead, its state exact at the mean speed of a step of ``step_s``. ``cp``, ``cv``: rows of position and
-    velocity.
+    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces and memory vary linearly over
+    the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it reduces the
+    velocity by as much as its limit allows and at most to rest (time stepping; Acary, Brogliato, Numerical Methods for
+    Nonsmooth Dynamical Systems, 2008, section 1.4). With bristles (``friction[5]`` > 0) it is the LuGre model, its
+    state exact at the mean speed of a step of ``step_s``. ``cp``, ``cv``: rows of position and velocity.
     ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
     """
     n, s = u.size, ad.shape[0]
@@ -123,7 +120,7 @@ def run_feedback(
                 for i in range(s):
                     p += cp[i] * x[i]
                     v += cv[i] * x[i]
-                    # where it would go without forces: the same in every pass
+                    # the motion without forces is the same in every pass
                     a = g0[i] * w0 + g1[i] * w1
                     for j in range(s):
                         a += ad[i, j] * x[j]

@@ -1,5 +1,6 @@
-"""An FMU as a twin: co-simulation (FMI 2, 3) or model exchange (FMI 2). It runs in a process of its own
-(``tools.guest``). One for model exchange whose equations are linear becomes the state space that it is.
+"""Uses an FMU as a twin: co-simulation (FMI 2, 3) or model exchange (FMI 2).
+
+The FMU runs in a process of its own (``tools.guest``). A linear FMU for model exchange becomes a state-space twin.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ MOST_BYTES, MOST_FILES = 1 << 30, 10_000
 
 
 class FmuRun:
-    """One free run per call. A copy in another process starts a process of its own for the FMU.
+    """Makes a free run of an FMU per call. A copy in another process starts its own process for the FMU.
 
-    ``named_by``: the file that names it, for messages; ``inputs`` and ``start`` (parameters) are what its matrices are
-    asked for with. ``NotTrusted`` for an FMU that the user has not trusted, ``RecordingError`` for a file that cannot
-    be opened as an FMU and for a run that fails, ``GuestDied`` for a crash.
+    ``named_by``: the file that names the FMU, for messages; its matrices are requested with ``inputs`` and ``start``
+    (parameters). Raises ``NotTrusted`` for an FMU that the user has not trusted, ``RecordingError`` for a file that
+    cannot be opened as an FMU and for a run that fails, ``GuestDied`` for a crash.
     """
 
     def __init__(
@@ -55,17 +56,17 @@ class FmuRun:
 
     def names(self) -> set[str]:
         """Return the variables of the FMU."""
-        return set(self._said("names"))
+        return set(self._described("names"))
 
     def kind(self) -> str:
         """Return ``CoSimulation`` or ``ModelExchange``."""
-        return str(self._said("kind"))
+        return str(self._described("kind"))
 
     def linear(self) -> Mapping[str, Any] | None:
-        """The matrices, states and start of an FMU for model exchange whose equations are linear, else None."""
-        return self._said("linear")
+        """Return the matrices, states and start of a linear FMU for model exchange, else None."""
+        return self._described("linear")
 
-    def _said(self, key: str) -> Any:
+    def _described(self, key: str) -> Any:
         try:
             return self.guest.opened()[0][key]
         except GuestError as error:
@@ -79,7 +80,7 @@ class FmuRun:
 
 
 def check_archive(path: Path) -> None:
-    """An archive that stays in its folder and within ``MOST_BYTES`` when it is unpacked; ``RecordingError`` if not."""
+    """Check that an archive unpacks into its folder and within ``MOST_BYTES``. Raises ``RecordingError`` if not."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -106,7 +107,7 @@ def _check_fmpy(where: Path) -> None:
 
 
 def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
-    """The FMU that ``[twin.parameters] path`` names beside the descriptor. RecordingError says what does not fit."""
+    """Load the FMU that ``[twin.parameters] path`` names beside the descriptor. Raises RecordingError on a fault."""
     where = f"{recording.path}: [twin.parameters]"
     name = recording.twin.parameters.get("path")
     if not isinstance(name, str):
@@ -126,7 +127,7 @@ def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
 
 
 def fmu_twin(recording: Recording) -> OpaqueTwin:
-    """An FMU for co-simulation as a program that runs freely: nothing is known of its inside."""
+    """Return an FMU for co-simulation as an opaque program."""
     path, run = opened_fmu(recording)
     twin = opaque_twin(recording, run, str(path), fixed=OWN_KEYS)
     hold = str(recording.twin.parameters.get("hold", "linear"))
@@ -134,8 +135,9 @@ def fmu_twin(recording: Recording) -> OpaqueTwin:
 
 
 def with_equations(recording: Recording) -> Recording:
-    """The recording with an FMU for model exchange as the state space that its equations are: forces then reach each of
-    its states. Any other recording comes back as it is. RecordingError where the equations are not linear.
+    """Return the recording with the state space of an FMU for model exchange, so that forces reach each of its states.
+
+    Any other recording is returned unchanged. Raises RecordingError if the equations are not linear.
     """
     if recording.twin.kind != "fmu":
         return recording

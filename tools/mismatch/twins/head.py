@@ -1,4 +1,4 @@
-"""What built-in twins have in common: their names and chain, and outputs that are an offset plus a scaled input."""
+"""Implements the common part of built-in twins: names, chain, and outputs that are an offset plus a scaled input."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tools.mismatch.twins.base import Run
 
 @dataclass(frozen=True)
 class Head:
-    """See ``Twin`` for what each means."""
+    """Holds the common fields of built-in twins (see ``Twin``)."""
 
     kind: str
     inputs: tuple[str, ...]

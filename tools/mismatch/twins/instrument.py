@@ -1,4 +1,4 @@
-"""The whole emulated bench as a twin: commands and handle motion in, DAQ channels and tip position out.
+"""Uses the whole emulated bench as a twin: commands and handle motion in, DAQ channels and tip position out.
 
 Signals, each optional: inputs ``command_1..3`` (V, amplifier outputs asked for; 50 V where absent), ``path_x|y|z`` (m,
 where the tip would be with the manipulator at rest, world frame) and ``angle_x|y|z`` (rad, small, about the attitude
@@ -45,7 +45,7 @@ OUTPUTS = re.compile(r"volts_[0-7]|tip_[xyz]")
 
 
 class GivenHand:
-    """A handle that moves as recorded: cubic splines through the samples, so that derivatives are consistent."""
+    """Moves the handle as recorded, along cubic splines through the samples, so that derivatives are consistent."""
 
     def __init__(self, frame: Array, t_s: Array, coordinates: Array) -> None:
         self.frame = frame
@@ -77,10 +77,10 @@ def simulate_instrument(
     own_hand: bool = False,
     start_s: float = 0.0,
 ) -> dict[str, Array]:
-    """One noiseless run. ``inputs`` holds ``t`` (n,) s and any of the twin's inputs (n,); ``outputs`` (n,) return.
+    """Make a noiseless run. ``inputs`` holds ``t`` (n,) s and any of the twin's inputs (n,); returns ``outputs`` (n,).
 
-    ``own_hand``: moved by the bench's own hand, not as ``inputs`` say; ``start_s`` of that world before the first
-    sample.
+    With ``own_hand`` the bench's own hand moves the instrument, not the ``inputs``; ``start_s`` is the time that its
+    world had run before the first sample.
     """
     t_s = inputs["t"]
     n = len(t_s)
@@ -113,7 +113,7 @@ def _si_unit(signal: str) -> str:
 
 
 def _world(recording: Recording) -> tuple[bool, float]:
-    """Return whether the bench's own hand moves the instrument, and how long its world had run at the first sample."""
+    """Return if the bench's own hand moves the instrument, and the time that its world had run at the first sample."""
     given = recording.twin.parameters
     where = f"{recording.path}: [twin.parameters]"
     unknown = [k for k in given if k not in names(PARAMETERS["instrument"])]
@@ -130,8 +130,9 @@ def _world(recording: Recording) -> tuple[bool, float]:
 
 
 def bench_world(recording: Recording) -> tuple[EmulationConfig, bool, float]:
-    """Return the emulated bench that ``[twin.parameters] bench`` names, whether its own hand moves it, and how long its
-    world had run at the first sample (s). RecordingError says which signal or file is wrong.
+    """Return the emulated bench of ``[twin.parameters] bench``, if its own hand moves it, and its time in s at start.
+
+    Raises RecordingError that names the faulty signal or file.
     """
     bench = recording.twin.parameters.get("bench")
     if not isinstance(bench, str):
@@ -160,7 +161,7 @@ def bench_world(recording: Recording) -> tuple[EmulationConfig, bool, float]:
 
 
 def instrument_twin(recording: Recording) -> OpaqueTwin:
-    """The bench that ``[twin.parameters] bench`` names. RecordingError says which signal or file is wrong."""
+    """Load the bench that ``[twin.parameters] bench`` names. Raises RecordingError that names the faulty file."""
     config, own_hand, start_s = bench_world(recording)
 
     def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:

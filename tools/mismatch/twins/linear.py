@@ -1,4 +1,4 @@
-"""Linear time-invariant plants: exact discretisation, compiled runs, and start states set by measured samples."""
+"""Simulates linear time-invariant plants: exact discretisation, compiled runs, start states from measured samples."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from sim_devices.physics.effect import Array
 from sim_devices.physics.exponential import exponential
 
 Hold = Literal["zero", "linear", "smooth", "discrete"]
-"""What an input does between its samples: it is held, runs straight, or has no content above half the sampling rate."""
+"""Course of an input between its samples: held, straight, or without content above half the sampling rate."""
 
 SIDE_TAPS = 12
 BAND = 0.9
-"""Share of the band below half the sampling rate in which a smooth input is met."""
+"""Share of the band below half the sampling rate in which a smooth input is reproduced."""
 
 
 @cache
 def smooth_taps() -> tuple[float, ...]:
-    """The filter (2 ``SIDE_TAPS`` + 1) after which straight lines between samples have the spectrum of the input.
+    """Return the filter (2 ``SIDE_TAPS`` + 1) after which straight lines between samples have the input's spectrum.
 
     Lines multiply a spectrum by sinc^2 (A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, 3rd ed.,
-    section 4.8.3); the taps meet its inverse by least squares over the ``BAND`` and leave a constant as it is.
+    section 4.8.3); the taps fit its inverse by least squares over the ``BAND`` and leave a constant unchanged.
     """
     w = np.linspace(0.0, BAND * np.pi, 1024)
     waves = 2.0 * (np.cos(np.outer(w, np.arange(1, SIDE_TAPS + 1))) - 1.0)
@@ -36,7 +36,7 @@ def smooth_taps() -> tuple[float, ...]:
 
 
 def between_samples(u: Array, hold: Hold) -> Array:
-    """The samples (n,) between which an input of this ``hold`` may be taken to run straight or to rest."""
+    """Return the samples (n,) between which an input of this ``hold`` may be taken as straight or held."""
     if hold != "smooth":
         return u
     return np.convolve(np.pad(u, SIDE_TAPS, mode="edge"), smooth_taps(), "valid")
@@ -52,9 +52,9 @@ class Discrete:
 
 
 def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
-    """Exact for an input that is held or runs linearly between samples.
+    """Discretise exactly for an input that is held or linear between samples.
 
-    A smooth input has been through ``between_samples`` first. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395:
+    A smooth input must have passed ``between_samples`` first. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395:
     blocks of one matrix exponential. ``discrete``: a and b are already those of the difference equation.
     """
     s = a.shape[0]
@@ -74,7 +74,7 @@ def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
 
 @kernel
 def run_states(ad, g0, g1, u, x0, starts):
-    """States (n, s) for one input (n,); the state is ``x0[i]`` (starts, s) at the i-th start."""
+    """Return states (n, s) for one input (n,); the state is ``x0[i]`` (starts, s) at the i-th start."""
     n, s = u.size, ad.shape[0]
     out = np.empty((n, s))
     if s == 2:
@@ -144,7 +144,7 @@ def run_states(ad, g0, g1, u, x0, starts):
 
 @kernel
 def run_pair(ad, g0, g1, c0, c1, u, starts):
-    """``c0 x[0] + c1 x[1]`` (n,) of a second-order plant for one input (n,), from zero state at each start."""
+    """Return ``c0 x[0] + c1 x[1]`` (n,) of a second-order plant for an input (n,), from zero state at each start."""
     n = u.size
     out = np.empty(n)
     a00, a01, a10, a11 = ad[0, 0], ad[0, 1], ad[1, 0], ad[1, 1]
@@ -167,7 +167,7 @@ def run_pair(ad, g0, g1, c0, c1, u, starts):
 
 @kernel
 def run_output(ad, g0, g1, c, u, starts):
-    """``c @ x`` (n,) for one input (n,) and one output row c (s,), from zero state at each start."""
+    """Return ``c @ x`` (n,) for one input (n,) and one output row c (s,), from zero state at each start."""
     n, s = u.size, ad.shape[0]
     out = np.empty(n)
     x = np.zeros(s)
@@ -194,7 +194,7 @@ def run_output(ad, g0, g1, c, u, starts):
 
 
 def free_response(ad: Array, c: Array, length: int) -> Array:
-    """``c @ ad^k`` for k = 0..length-1, (length, s): the output for each unit start state."""
+    """Return ``c @ ad^k`` for k = 0..length-1, (length, s): the output for each unit start state."""
     s = ad.shape[0]
     x0 = np.eye(s)
     zero = np.zeros(length)
@@ -207,7 +207,7 @@ def free_response(ad: Array, c: Array, length: int) -> Array:
 
 
 def free_by_blocks(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
-    """``free_response`` of a block-diagonal ``ad``: each block (first row, last row + 1) runs by itself."""
+    """Return ``free_response`` of a block-diagonal ``ad``: each block (first row, last row + 1) runs by itself."""
     if len(blocks) < 2:
         return free_response(ad, c, length)
     parts = (free_response(np.ascontiguousarray(ad[a:b, a:b]), np.ascontiguousarray(c[a:b]), length) for a, b in blocks)
@@ -215,7 +215,7 @@ def free_by_blocks(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, in
 
 
 def felt_at_most(ad: Array, longest: int) -> int:
-    """Samples after which a free response has decayed below 1e-12 of its largest for sure, ``longest`` at most."""
+    """Return a bound on the samples after which a free response is below 1e-12 of its largest, at most ``longest``."""
     slowest = float(np.max(np.abs(np.linalg.eigvals(ad)), initial=0.0))
     if slowest >= 1.0:
         return longest
@@ -224,7 +224,7 @@ def felt_at_most(ad: Array, longest: int) -> int:
 
 
 def forgets(ad: Array, samples: int) -> bool:
-    """Return whether no mode integrates or grows within so many samples: each decays, or swings and does not grow."""
+    """Return True if no mode integrates or grows within so many samples: each decays, or swings without growth."""
     poles = np.linalg.eigvals(ad)
     size = np.abs(poles)
     swings = (size <= 1.0 + 1e-12) & (np.abs(np.angle(poles)) * samples > 1.0)
@@ -232,11 +232,11 @@ def forgets(ad: Array, samples: int) -> bool:
 
 
 FORGOTTEN = 0.6
-"""Size of a free response at the end of a stretch, over that at its beginning, below which it is no integrator's."""
+"""Ratio of a free response at the end of a stretch to that at its start, below which it is not an integrator's."""
 
 
 def _while_felt(free: Array, window: int) -> Array:
-    """Free responses up to where they have decayed below 1e-12 of their largest, at least over ``window``."""
+    """Return free responses until they are below 1e-12 of their largest, at least over ``window``."""
     size = np.abs(free).max(axis=1, initial=0.0)
     felt = np.flatnonzero(size > 1e-12 * size.max(initial=0.0))
     return free[: max(window, int(felt[-1]) + 1 if felt.size else 0)]
@@ -260,7 +260,7 @@ class StartState:
     memo: dict[object, Array] = field(default_factory=dict[object, Array], compare=False, repr=False)
 
     def states(self, need: dict[str, Array]) -> Array:
-        """(starts, s): start states whose free response meets ``need`` (n,) per output at the samples."""
+        """Return start states (starts, s) whose free response fits ``need`` (n,) per output at the samples."""
         rows: list[Array] = []
         for at, solver in zip(self.samples, self.solvers, strict=True):
             stacked = np.concatenate([need[o][at] * self.weight[o] for o in self.outputs])
@@ -268,10 +268,10 @@ class StartState:
         return np.stack(rows)
 
     def steady(self, y: Mapping[str, Array], period: int) -> Array:
-        """(starts, s): start states with which responses ``y`` (n,) from rest to inputs that repeat do so, too.
+        """Return start states (starts, s) that make responses ``y`` (n,) to periodic inputs periodic.
 
-        From rest ``y`` differs one period later by the free response of the state x that it has reached by then, and
-        the steady state starts from x / (1 - A^period).
+        From rest, ``y`` differs one period later by the free response of the state x that it has reached by then; the
+        steady state starts from x / (1 - A^period).
         """
         key = ("steady", period)
         if key not in self.memo:
@@ -294,11 +294,11 @@ class StartState:
         return np.stack(rows)
 
     def response(self, states: Array, output: str, n: int) -> Array:
-        """Free response (n,) of one output for states (starts, s)."""
+        """Return the free response (n,) of an output for states (starts, s)."""
         return self.added(np.zeros(n), states, output)
 
     def added(self, y: Array, states: Array, output: str) -> Array:
-        """``y`` (n,), changed in place, with the free response of one output added while it is felt."""
+        """Add the free response of an output to ``y`` (n,) in place while it is not negligible; return ``y``."""
         free = self.free[output]
         for (a, b), x0 in zip(self.spans, states, strict=True):
             m = min(b - a, free.shape[0])
@@ -307,7 +307,7 @@ class StartState:
 
 
 MOST_SETTING = 4000
-"""Samples that set one start state at most; of more, as many at irregular distances are taken."""
+"""Largest number of samples that set a start state; of more, as many at irregular distances are selected."""
 
 
 def start_state(
@@ -366,38 +366,38 @@ def start_state(
 
 
 LEAST_ROUGH = 0.01
-"""Misfit of a simulation, as a fraction of the recorded range, that start states have to stand at least."""
+"""Least assumed misfit of a simulation, as a fraction of the recorded range, in the regularisation of start states."""
 ROUGH_OF_A_PERIOD = 1e-6
-"""The same for a start state that follows from the period: no measurement is involved, only digits."""
+"""Assumed misfit for a start state that follows from the period: it involves rounding, but no measurement."""
 LEAST_ROUGH_OF_A_WINDOW = 0.03
-"""The same where the first samples alone set a state: the twin may be as given, and nothing was fitted to them."""
+"""Least assumed misfit where only the first samples set a state: the twin may be unfitted."""
 NUMERICAL_RANK = 1e-10
-"""Combinations of start states whose response is smaller than this, relative to the largest, are not told apart."""
+"""Relative response below which combinations of start states are numerically indistinguishable."""
 
 
 def held_inverse(seen: Array, whole: Array, rough: float) -> Array:
-    """Least-squares inverse (s, rows) of free responses, in which what the data do not determine stays at zero.
+    """Return the regularised inverse (s, rows) of free responses; undetermined combinations of states stay at zero.
 
     ``seen`` (rows, s): the responses to unit start states at the samples that set the state; ``whole`` (m, s): at
     samples of the whole stretch; ``rough``: misfit over recorded range. A combination of start states is determined
     where a misfit of that size at the samples moves its response nowhere by more than the range. The weight of a
     combination falls with the fourth power of that ratio (filter factors, steeper than Tikhonov's: P. C. Hansen,
-    Rank-Deficient and Discrete Ill-Posed Problems, 1998): smooth in the poles, without a bias where the data speak.
-    The result does not depend on the coordinates of the state.
+    Rank-Deficient and Discrete Ill-Posed Problems, 1998). It is smooth in the poles, and combinations that the data
+    determine have no bias. The result does not depend on the coordinates of the state.
     """
     size = np.maximum(np.max(np.abs(whole), axis=0, initial=0.0), 1e-300)
     responses, strength, combine = np.linalg.svd(whole / size, full_matrices=False)
     kept = strength > NUMERICAL_RANK * strength[0]
     to_state = combine[kept].T / strength[kept] / size[:, None]
-    left, shown, right = np.linalg.svd(seen @ to_state, full_matrices=False)
+    left, sensitivity, right = np.linalg.svd(seen @ to_state, full_matrices=False)
     peak = np.max(np.abs(responses[:, kept] @ right.T), axis=0)
-    ratio = rough * peak / np.maximum(shown, 1e-300)
-    gain = 1.0 / (np.maximum(shown, 1e-300) * (1.0 + np.minimum(ratio, 1e60) ** 4))
+    ratio = rough * peak / np.maximum(sensitivity, 1e-300)
+    gain = 1.0 / (np.maximum(sensitivity, 1e-300) * (1.0 + np.minimum(ratio, 1e60) ** 4))
     return np.ascontiguousarray((to_state @ right.T * gain) @ left.T)
 
 
 def response_shape(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
-    """``free_response`` (m, s) at all of its first samples, then at every second, fourth and so on up to ``length``."""
+    """Return ``free_response`` (m, s) at all first samples, then at every second, fourth and so on up to ``length``."""
     parts = [free_by_blocks(ad, c, min(length, 2 * OCTAVE), blocks)]
     stride = 1
     while 2 * OCTAVE * stride < length:
@@ -409,11 +409,11 @@ def response_shape(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, in
 
 
 OCTAVE = 128
-"""Samples of a free response in every octave of time since its start."""
+"""Number of samples of a free response in every octave of time since its start."""
 
 
 def _roughness(x: Array, memo: dict[object, object], output: str) -> float:
-    """Noise of a record over its range, by its second differences (median); remembered."""
+    """Return the noise of a record over its range, by the median of its second differences; cached."""
     key = ("roughness", output)
     found = memo.get(key)
     if not isinstance(found, float):
@@ -424,7 +424,7 @@ def _roughness(x: Array, memo: dict[object, object], output: str) -> float:
 
 
 def _setting(start: int, stop: int, window: int, setting: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    """Sample numbers from ``start`` to ``stop`` that may set the state at ``start``."""
+    """Return the sample numbers from ``start`` to ``stop`` that may set the state at ``start``."""
     first = np.arange(start, min(start + window, stop))
     if setting is None:
         return first
@@ -434,17 +434,17 @@ def _setting(start: int, stop: int, window: int, setting: NDArray[np.int64] | No
     if inside.size > MOST_SETTING:
         edges = np.linspace(0, inside.size, MOST_SETTING + 1).astype(np.int64)
         width = np.diff(edges)
-        # a regular stride would fold lines of the spectrum
+        # a regular stride would alias lines of the spectrum
         inside = inside[edges[:-1] + (width * np.random.default_rng(inside.size).random(width.size)).astype(np.int64)]
     return inside
 
 
 LEAST_SETTING = 8
-"""Samples that may set a state, below which the first samples after the start do."""
+"""Least number of samples that may set a state; with fewer, the first samples after the start do."""
 
 
 def _padded(free: Array, since: NDArray[np.int64]) -> Array:
-    """Rows of a free response, zero where it has decayed."""
+    """Return rows of a free response, zero where it has decayed."""
     out = np.zeros((since.size, free.shape[1]))
     felt = since < free.shape[0]
     out[felt] = free[since[felt]]

@@ -1,4 +1,4 @@
-"""From the ``[twin]`` table to a twin, effects included."""
+"""Builds a twin from the ``[twin]`` table, effects included."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from tools.mismatch.twins.core import core
 
 
 def make(recording: Recording) -> Twin:
-    """The twin of a recording; effects of a corrected twin are part of its base physics.
+    """Build the twin of a recording; effects of a corrected twin are part of its base physics.
 
-    Unknown kinds, parameters and effects are RecordingErrors.
+    Raises RecordingError for unknown kinds, parameters and effects.
     """
     if recording.twin.effects:
         from tools.mismatch.twins.corrected import corrected_twin

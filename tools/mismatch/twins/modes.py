@@ -1,4 +1,4 @@
-"""The modes of a linear plant: pairs of complex poles and real ones, their companion forms, and which share one."""
+"""Splits a linear plant into modes (pairs of complex poles, real poles) and groups them into companion forms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Complex = NDArray[np.complex128]
 
 
 def typical_size(roots: Complex, span: float) -> float:
-    """The typical size of some roots: companion states are scaled by its powers so that they are of one size."""
+    """Return the typical size of some roots; companion states are scaled by its powers to be of one size."""
     sizes = np.abs(roots)
     sizes = sizes[sizes > 1e-9 * (sizes.max() if sizes.size else 1.0)]
     return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0 / span
@@ -23,9 +23,9 @@ def typical_size(roots: Complex, span: float) -> float:
 
 @dataclass(frozen=True)
 class Mode:
-    """One mode in continuous terms: a ``pair`` of complex poles, a ``real`` one, or a pole that stays as given.
+    """Describes a mode in continuous terms: a ``pair`` of complex poles, a ``real`` one, or a ``fixed`` pole.
 
-    A pole is ``fixed`` where it integrates, or where no continuous one stands for it; ``value`` is then that of s or z.
+    A pole is ``fixed`` if it integrates or has no continuous equivalent; ``value`` is then that of s or z.
     """
 
     kind: Literal["pair", "real", "fixed"]
@@ -33,12 +33,12 @@ class Mode:
 
     @property
     def order(self) -> int:
-        """Return how many poles it has."""
+        """Return the number of poles."""
         return 2 if self.kind == "pair" else 1
 
 
 def modes_of(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
-    """The modes of a set of poles that is closed under conjugation."""
+    """Return the modes of a set of poles that is closed under conjugation."""
     modes: list[Mode] = []
     size = max(float(np.max(np.abs(poles))), 1e-300) if poles.size else 1.0
     for p in poles:
@@ -62,8 +62,9 @@ def modes_of(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
 
 
 def roots_of_mode(mode: Mode, discrete: bool, dt: float) -> Complex:
-    """Its poles: of s, or of z - 1 for a discrete twin (G. C. Goodwin et al., the delta operator: companion states
-    stay apart however fast it is sampled).
+    """Return the poles of a mode in s, or in z - 1 for a discrete twin.
+
+    With the delta operator (G. C. Goodwin et al.) companion states stay distinct at any sampling rate.
     """
     if mode.kind == "fixed":
         return np.array([mode.value - (1.0 if discrete else 0.0)])
@@ -72,7 +73,7 @@ def roots_of_mode(mode: Mode, discrete: bool, dt: float) -> Complex:
 
 
 def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Array]:
-    """Companion form (s, s) and its input (s,) of these roots of s or z - 1, states scaled by powers of ``omega``."""
+    """Return companion form (s, s) and input (s,) of roots of s or z - 1, states scaled by powers of ``omega``."""
     s = roots.size
     if s == 2:
         den = np.array([1.0, -float(np.sum(roots).real), float(np.prod(roots).real)])
@@ -87,19 +88,19 @@ def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Arra
 
 
 SMALL = 4
-"""A plant of so few modes is one chain: its numerators keep the zeros that the engineer's have."""
+"""Largest number of modes of a plant that is always one chain; its numerators keep the engineer's zeros."""
 SPREAD = 1e3
-"""... unless its poles are of sizes that differ by more than this factor."""
+"""Ratio of the sizes of poles above which even a plant of ``SMALL`` modes is not one chain."""
 ALIKE = 0.98
-"""Correlation of the impulse responses of two modes above which their residues mean nothing one by one."""
+"""Correlation of the impulse responses of two modes above which their residues are not identifiable separately."""
 MOST_CHAINED = 6  # poles
 
 
 def chains_of(modes: Sequence[Mode], dt: float) -> list[list[int]]:
-    """Which modes make one companion form: all of a small plant, else those too much alike for partial fractions.
+    """Group the modes that share a companion form: all of a small plant, else those too similar for partial fractions.
 
-    Partial fractions stay well conditioned at any order as long as poles lie apart; companion forms do where they are
-    few and of one size.
+    Partial fractions stay well conditioned at any order if poles are separated; companion forms do if poles are few
+    and of similar size.
     """
     sizes = [abs(x.value) for x in modes if x.kind != "fixed"]
     narrow = not sizes or max(sizes) < SPREAD * min(sizes)
@@ -118,7 +119,7 @@ def chains_of(modes: Sequence[Mode], dt: float) -> list[list[int]]:
 
 
 def _alike(a: Mode, b: Mode) -> float:
-    """Correlation of two decays; poles that are fixed go with each other."""
+    """Return the correlation of two decays; fixed poles count as fully correlated."""
     if "fixed" in (a.kind, b.kind):
         return 1.0 if a.kind == b.kind else 0.0
     p, q = a.value, b.value

@@ -1,4 +1,4 @@
-"""Differential equations as a twin: named states, so that forces and flows can be added to the derivative of each."""
+"""Uses differential equations as a twin; forces and flows can be added to the derivative of each named state."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tools.mismatch.twins.ode_run import SWAY
 
 MOST_SUBSTEPS = 200
 LEAST_WINDOW = 20
-FORGOTTEN = 20.0  # time constants in a record: a slower state is set afresh in every stretch
+FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class OdeTwin(Head):
     typical: Array
     """Size of each state in a run as given, (s,)."""
     middle: tuple[Array, Array]
-    """Mean states (s,) and signals (m,) of that run."""
+    """Mean states (s,) and signals (m,) of a run as given."""
     places: tuple[Place, ...]
     fastest_per_s: float
     restart: bool
     integrates: bool
-    """Whether a start state is not forgotten within the recording."""
+    """True if the response to a start state does not decay within the recording."""
     feedback_on: str
     static: bool = False
     apart: bool = False
@@ -69,7 +69,7 @@ class OdeTwin(Head):
 
     @property
     def hold(self) -> str:
-        """Return what the inputs do between their samples: "zero" or "linear"."""
+        """Return the hold of the inputs between their samples: "zero" or "linear"."""
         return "zero" if self.held else "linear"
 
     def start(self, recording: Recording) -> Array:
@@ -77,7 +77,7 @@ class OdeTwin(Head):
         return np.array([float(self.given[self.names[i]]) for i in self.free])
 
     def values(self, theta: Array) -> Array:
-        """All numbers of the equations for base parameters ``theta`` (further entries are ignored)."""
+        """Return the numbers of the equations for base parameters ``theta`` (further entries are ignored)."""
         out = np.array([float(self.given[n]) for n in self.names])
         out[list(self.free)] = theta[: len(self.free)]
         return out
@@ -94,7 +94,7 @@ class OdeTwin(Head):
 
     @cached_property
     def start_values(self) -> Array:
-        """The engineer's own numbers."""
+        """Return the engineer's own numbers."""
         return np.array([float(self.given[n]) for n in self.names])
 
     def sensitivity(self, output: str, theta: Array) -> float:
@@ -119,7 +119,7 @@ class OdeTwin(Head):
     # -- places ---------------------------------------------------------------------------------------
 
     def place(self, name: str) -> Place:
-        """The place of that name. Raises RecordingError: a twin file may name any."""
+        """Return the place of that name. Raises RecordingError for an unknown one, which a twin file may name."""
         for p in self.places:
             if p.name == name:
                 return p
@@ -127,7 +127,7 @@ class OdeTwin(Head):
         raise RecordingError(f"no state '{name}' that a force or flow can act on; there are: {known}")
 
     def force_gain(self, target: str, theta: Array) -> tuple[float, str]:
-        """What one unit of the input that drives a place does to its derivative there, and that input ("" : none)."""
+        """Return the gain from the input that drives a place to the derivative there, and that input ("": none)."""
         if self.place(target).kind == "parameter":
             return 1.0, ""
         row = self.linearised(self.values(theta)).b[self.place(target).target]
@@ -137,14 +137,14 @@ class OdeTwin(Head):
         return 1.0, ""
 
     def place_units(self, target: str) -> tuple[str, str]:
-        """Units of a force at a place (that of the input which drives it, where one does) and of its position."""
+        """Return the units of a force at a place (that of the input that drives it, if any) and of its position."""
         place = self.place(target)
         _, source = self.force_gain(target, self.start_values[list(self.free)])
         per = "s^2" if place.kind == "motion" else "s"
         return (self.units[source] if source else f"{place.unit}/{per}"), place.unit
 
     def force_scale(self, target: str) -> tuple[float, float, float]:
-        """Typical derivative, position and velocity at a place: what the size of a weight is measured by."""
+        """Return typical derivative, position and velocity at a place, which scale the weights."""
         place = self.place(target)
         size, speed = self.typical[place.position], self.typical[place.velocity]
         if place.kind == "storage":
@@ -153,7 +153,7 @@ class OdeTwin(Head):
         return speed * max(self.fastest_per_s, speed / size), size, speed
 
     def course(self, run: Run, theta: Array, target: str) -> tuple[Array, Array]:
-        """Position and velocity (n,) at a place: as recorded where an output reads them, else as simulated."""
+        """Return position and velocity (n,) at a place: as recorded if an output reads them, else as simulated."""
         place = self.place(target)
         if place.kind == "parameter":
             signal = run.signals[self.signals[place.position]]
@@ -162,7 +162,7 @@ class OdeTwin(Head):
         return position, velocity
 
     def storage_ranges(self, run: Run, theta: Array, target: str, mask: NDArray[np.bool_]) -> tuple[float, ...]:
-        """What is known of every storage of a place where ``mask`` (n,) is set: see ``flows.RANGES``."""
+        """Return the ranges (``flows.RANGES``) of every storage of a place where ``mask`` (n,) is set."""
         stores = dict.fromkeys(int(v) for v in self.place(target).pairs[::2])
         found: list[float] = []
         for x, recorded in self._courses(run, theta, tuple(stores)):
@@ -172,7 +172,7 @@ class OdeTwin(Head):
         return tuple(found)
 
     def _courses(self, run: Run, theta: Array, states: Sequence[int]) -> list[tuple[Array, bool]]:
-        """Courses (n,) of these states, and whether an output reads them: then as recorded, else as simulated."""
+        """Return the courses (n,) of states, and if an output reads them: then as recorded, else as simulated."""
         x = self._simulated(run, {s: run.signals[s] for s in self.signals}, theta, ())
         c = self.linearised(self.values(theta)).c
         found: list[tuple[Array, bool]] = []
@@ -208,19 +208,19 @@ class OdeTwin(Head):
     def states(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
     ) -> tuple[Array, Array]:
-        """States (n, s) of a free run, and the signals (n, m) that the equations saw; ``inputs`` without columns."""
-        # a made-up stretch that only asks which parameters are linear has no context
+        """Return states (n, s) of a free run and the signals (n, m) of the equations; ``inputs`` have no columns."""
+        # the synthetic stretch that tests which parameters are linear has no context
         none = np.zeros(run.t.size)
         signals = {s: inputs[s].value if s in inputs else run.signals.get(s, none) for s in self.signals}
         return self._simulated(run, signals, theta, forces), np.column_stack([signals[s] for s in self.signals])
 
     def readings(self, x: Array, run: Run, theta: Array) -> Array:
-        """Outputs (n, q) for states (n, s) of a run."""
+        """Return outputs (n, q) for states (n, s) of a run."""
         u = np.column_stack([run.signals[s] for s in self.signals])
         return self.equations.readings(x, u, run.t, self.values(theta))
 
     def packed(self, forces: Sequence[Force]) -> Inside:
-        """Forces and flows, packed for the compiled loop."""
+        """Return forces and flows, packed for the compiled loop."""
         by: dict[str, list[Force]] = {}
         for f in forces:
             by.setdefault(f.target, []).append(f)
@@ -247,11 +247,11 @@ class OdeTwin(Head):
         )
 
     def substeps(self, dt: float, inside: Inside) -> int:
-        """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (a power of two, so
-        that it seldom changes while a fit moves), six to a period of cogging.
+        """Return the steps per sample, a power of two so that it seldom changes during a fit.
 
-        Where dry friction may stick: two at least, and up to eight for 32 to a radian, because a step in which the
-        velocity crosses zero is of second order only.
+        There are four steps per radian of the fastest mode, two per radian of the stiffest memory and six per period of
+        cogging. Where dry friction may stick, there are at least two and up to eight, for 32 per radian, because a step
+        in which the velocity crosses zero is of second order only.
         """
         fastest_per_s = inside.fastest_per_s or self.fastest_per_s
         sub = int(np.ceil(dt * fastest_per_s / 0.25))
@@ -267,7 +267,7 @@ class OdeTwin(Head):
         return int(np.clip(sub, 1, MOST_SUBSTEPS))
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
-        """States (n, s) in free run from start states that the measured samples of each stretch set."""
+        """Return states (n, s) of a free run from start states that the measured samples of each stretch set."""
         values = self.values(theta)
         inside = self.packed(forces)
         sub = self.substeps(run.dt, inside)
@@ -297,7 +297,7 @@ class OdeTwin(Head):
             begin = shot_to_repeat(once, full, np.repeat(given, starts.size, axis=0), u, starts, run.period)
             if begin is not None:
                 return go(begin, starts, ends, u, run.t)
-        # what sets the state is simulated alone, one window after the other
+        # the windows that set the state are simulated alone, one after the other
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
@@ -313,7 +313,7 @@ class OdeTwin(Head):
             return (y - self.equations.readings(x, part, t, values)) * weight
 
         def plain() -> Array:
-            # the engineer's own model, run through from its own start: where later stretches begin to be sought
+            # a run of the engineer's own model from its own start gives first guesses for later stretches
             end, sub = np.array([run.t.size], np.int64), self.substeps(run.dt, NOTHING)
             return go(given, starts[:1], end, u, run.t, sub, self.start_values, NOTHING)[starts]
 
@@ -322,7 +322,7 @@ class OdeTwin(Head):
         x0 = meet_start(x0, misses, rows, self.typical, limits)
         if run.setting is None or not self.integrates:
             return go(x0, starts, ends, u, run.t)
-        # then all samples that may: first ones show it with their noise, and an effect behind may hide it in them
+        # then all permitted samples count: the first ones are noisy, and an effect behind may hide the state in them
         seen = run.setting
         of = np.searchsorted(starts, seen, side="right") - 1
         used, rows = np.unique(of, return_inverse=True)
@@ -341,9 +341,9 @@ class OdeTwin(Head):
         return go(with_some(found), starts, ends, u, run.t)
 
     def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array) -> Array:
-        """States (k, s) moved as little as possible to where the outputs (k, q) read what was measured.
+        """Move states (k, s) as little as possible so that the outputs (k, q) equal the measurement.
 
-        A run that has drifted away says nothing of where in a force that depends on position the next one begins.
+        A run that has drifted away does not determine the start of the next one in a position-dependent force.
         """
         reading = self.linearised(values).c * self.typical
         gap = y - self.equations.readings(np.ascontiguousarray(x), np.ascontiguousarray(u), t, values)
@@ -352,7 +352,7 @@ class OdeTwin(Head):
     # -- linearised -----------------------------------------------------------------------------------
 
     def linearised(self, values: Array) -> Linearised:
-        """About the mean of a run as given, for these numbers."""
+        """Linearise about the mean of a run as given, for these numbers."""
         return linearise(self.equations, *self.middle, self.typical, values)
 
     def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
@@ -383,14 +383,16 @@ def _settings(force: Force) -> tuple[object, ...]:
 
 
 def inside_of(twin: object) -> OdeTwin | None:
-    """The equations behind a twin, plain or corrected; None for a twin of another kind."""
+    """Return the equations of a twin, plain or corrected; None for a twin of another kind."""
     core = getattr(twin, "core", twin)
     return core if isinstance(core, OdeTwin) else None
 
 
 def weight_scale(unit: str, push: float, size: float, speed: float) -> float:
-    """Typical size of a weight: the derivative ``push`` over what the weight multiplies, whose size follows from the
-    ``unit`` of the weight (with ``{out}`` for that of the position) and from typical position and velocity.
+    """Return the typical size of a weight: the derivative ``push`` over the size of the quantity that it multiplies.
+
+    That size follows from the ``unit`` of the weight (``{out}`` stands for the unit of the position) and from typical
+    position and velocity.
     """
     try:
         d = units.parse(unit.replace("{out}", "m")).dimension

@@ -1,4 +1,4 @@
-"""State space with physical states: the same matrices as differential equations, so that forces reach each state."""
+"""Writes a state space with physical states as differential equations, so that forces reach each state."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.state_space import Matrices
 
 STRUCTURE = (0.0, 1.0, -1.0)
-"""Entries that say how states hang together (a position is the integral of a velocity) and are not re-fitted."""
+"""Entries that express structure (a position is the integral of a velocity) and are not re-fitted."""
 
 
 def physical_twin(recording: Recording, m: Matrices) -> OdeTwin:
-    """The twin of matrices whose ``states`` have names and units. Every other entry of A, B and y0 may be re-fitted.
+    """Build the twin of matrices with named ``states``. All entries of A, B and y0 but ``STRUCTURE`` may be re-fitted.
 
-    Raises RecordingError for a discrete model and for states that do not fit A.
+    Raises RecordingError for a discrete model and for states that do not match A.
     """
     where = f"{recording.path}: [twin.parameters]"
     if m.discrete:

@@ -1,4 +1,4 @@
-"""Free runs of differential equations with forces and flows inside, in fixed steps."""
+"""Integrates differential equations with forces and flows inside, in free run and fixed steps."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from hal.compiled import kernel
 from sim_devices.physics.forces import FRICTION, bristle_after, flow_of, friction_limit, smooth_force
 from tools.mismatch.twins.program import run_program
 
-SWAY = 4  # columns of a varying parameter: its register, the register that it follows, the strength, the centre
+SWAY = 4  # number of columns of a varying parameter: its register, the register that it follows, strength, centre
 
 
 @kernel
 def rates_of(operations, registers, results, x, u, t, rates):
-    """Derivatives ``rates`` (s,) of the states ``x`` (s,) at the inputs ``u`` (m,), without forces.
+    """Compute derivatives ``rates`` (s,) of the states ``x`` (s,) at the inputs ``u`` (m,), without forces.
 
     Registers: time, states, inputs (and recorded signals), parameters.
     """
@@ -33,7 +33,7 @@ def run_equations(
     operations, registers0, results, sway, x0, starts, stop, u, held, times, step_s, sub,
     place, friction, spring, cogging, counts, thresholds, memory, flows, lowest, highest,
 ):  # fmt: skip
-    """States (n, s) in free run from ``x0`` (starts, s): Runge-Kutta steps of fourth order, ``sub`` to a sample.
+    """Return states (n, s) of a free run from ``x0`` (starts, s) by fourth-order Runge-Kutta, ``sub`` steps per sample.
 
     Between samples the inputs ``u`` (n, m) run straight, or are ``held`` (m,). States stay within ``lowest`` and
     ``highest`` (s,). ``stop`` (starts,) ends a stretch. ``times`` (n,): seconds of each sample.
@@ -46,7 +46,7 @@ def run_equations(
     rests while the other forces are within the limit, else the rest of the step is slip the other way (Karnopp, J. Dyn.
     Syst. Meas. Control 107, 1985, 100, without his band).
 
-    The derivative is worked out in one place of the loop and not in a function: a call that hands over arrays counts
+    The derivative is computed in one place of the loop and not in a function: a call that passes arrays counts
     references to each of them, which costs more than the equations.
     """
     n, m = u.shape
@@ -57,10 +57,10 @@ def run_equations(
     first = np.zeros(max(sway.shape[0], 1))
     # at the begin of a step, where the derivative is asked for, at the end of the step
     x, y, z = np.zeros(s), np.zeros(s), np.zeros(s)
-    rates = np.zeros((5, s))  # of the four stages, and that which decides between slip and rest
+    rates = np.zeros((5, s))  # derivatives of the four stages, and the one that decides between slip and rest
     played = np.zeros(thresholds.size)
-    bristle = np.zeros((places, 2))  # deflection, velocity when a step began
-    pushed = np.zeros(places)  # by all other forces when a step began
+    bristle = np.zeros((places, 2))  # deflection and velocity at the start of a step
+    pushed = np.zeros(places)  # sum of all other forces at the start of a step
     crossed = np.zeros(places)
     mode = np.zeros(places, np.int64)  # direction of slip (+1, -1), 2 at rest, 0 without dry friction
     dry = np.zeros(places, np.bool_)
@@ -185,10 +185,10 @@ def run_equations(
                         over = abs(push) - friction_limit(0.0, sign, friction, q * FRICTION)
                         vn = 0.0
                         if over > 0.0 and mode[q] != 2:
-                            # the rest of the step is slip the other way
+                            # the rest of the step is slip in the other direction
                             vn = sign * over * (1.0 - crossed[q]) * h
                         elif over > 0.0 and push != pushed[q]:
-                            # what exceeds the limit at the end of the step has grown from zero on the way
+                            # the excess over the limit at the end of the step has grown from zero within it
                             vn = sign * 0.5 * over * h * min(over / abs(push - pushed[q]), 1.0)
                         z[place[q, 1]] = vn
                         p = z[place[q, 0]]
@@ -204,7 +204,7 @@ def run_equations(
 
 @kernel
 def run_readings(operations, registers0, results, x, u, t):
-    """Outputs (n, q) for states (n, s), inputs (n, m) and times (n,)."""
+    """Return outputs (n, q) for states (n, s), inputs (n, m) and times (n,)."""
     n = u.shape[0]
     out = np.empty((n, results.size))
     registers = registers0.copy()

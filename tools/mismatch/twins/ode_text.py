@@ -1,4 +1,4 @@
-"""From a ``[twin]`` table with equations, or the name of a Python function, to a twin of differential equations."""
+"""Builds a twin of differential equations from a ``[twin]`` table with equations or a named Python function."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.program import parse
 
 TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")
-"""Keys of an ode twin that are no numbers; beside ``parameters`` in ``[twin]``, or inside it."""
+"""Keys of an ode twin that are not numbers; they stand beside ``parameters`` in ``[twin]``, or inside it."""
 PROBES = 5
 
 
 def ode_twin(recording: Recording) -> OdeTwin:
-    """The twin that a recording's table describes. Raises RecordingError that names the key and what to do."""
+    """Build the twin that a recording's table describes. Raises RecordingError that names the key and the remedy."""
     table = recording.twin.parameters
     where = f"{recording.path}: [twin]"
     unknown = [k for k, v in table.items() if k not in TABLES and not _number(v)]
@@ -59,7 +59,7 @@ def assembled(
     signals: tuple[str, ...],
     names: Sequence[str],
 ) -> OdeTwin:
-    """The twin around equations of whatever origin, with what a run as given tells of it."""
+    """Build the twin around equations of any origin, with typical sizes from a run as given."""
     table, where = recording.twin.parameters, f"{recording.path}: [twin]"
     hold = table.get("hold", "linear")
     if hold not in ("zero", "linear"):
@@ -121,7 +121,7 @@ def assembled(
 def _as_given(
     recording: Recording, equations: Equations, states: tuple[State, ...], u: Array, values: Array, held: bool
 ) -> Array:
-    """States (n, s) of one free run with the engineer's numbers from the engineer's start."""
+    """Return states (n, s) of a free run with the engineer's numbers from the engineer's start."""
     n = u.shape[0]
     x0 = np.array([[state.start for state in states]])
     limits = (np.array([state.lowest for state in states]), np.array([state.highest for state in states]))
@@ -145,7 +145,7 @@ def _as_given(
 
 
 def _typical(x: Array, states: tuple[State, ...]) -> Array:
-    """Size of each state in a run: its spread, or its value where it stays."""
+    """Return the size of each state in a run: its spread, or its value if it is constant."""
     size = np.std(x, axis=0)
     return np.where(size > 0.0, size, np.maximum(np.max(np.abs(x), axis=0), 1e-6))
 
@@ -153,9 +153,9 @@ def _typical(x: Array, states: tuple[State, ...]) -> Array:
 def _places(
     equations: Equations, states: tuple[State, ...], x: Array, u: Array, values: Array, slopes: Array
 ) -> tuple[Place, ...]:
-    """A state whose derivative is another state is a position, the other its velocity; every other state is a storage.
+    """Classify states: one whose derivative is another state is a position, the other its velocity, the rest storages.
 
-    Whether the derivative of one is the other is tried at points of a run that are shaken at random.
+    The relation is tested at randomly perturbed points of a run.
     """
     rng = np.random.default_rng(0)
     s = x.shape[1]
@@ -193,7 +193,7 @@ def _parameters(
     names: Sequence[str],
     free: Sequence[int],
 ) -> list[Place]:
-    """Each parameter that may be re-fitted beside each recorded signal which is no input of the twin."""
+    """Pair each parameter that may be re-fitted with each recorded signal that is no input of the twin."""
     first = 1.0 + len(states)
     return [
         Place(
@@ -250,7 +250,7 @@ def _programs(
     names: tuple[str, ...],
     every: tuple[str, ...],
 ) -> Programs:
-    """Equations from text, or by tracing the Python function that is named. Raises EquationError."""
+    """Build equations from text, or by tracing the named Python function. Raises EquationError."""
     texts, function = table.get("equations"), table.get("function")
     if (texts is None) == (function is None):
         raise EquationError("needs either equations, or function = 'file.py:name'")
@@ -261,7 +261,7 @@ def _programs(
         missing = [s for s in own if s not in texts]
         if missing:
             raise EquationError(f"no equation for the derivative of state '{missing[0]}'")
-        # the name of a state means its value in an equation, and its derivative as the name of one
+        # the name of a state means its value inside an equation, and its derivative as the name of an equation
         renamed = {f"derivative of {k}" if k in own else k: v for k, v in texts.items()}
         clash = [k for k in texts if k in every and k not in own]
         if clash:
@@ -300,7 +300,7 @@ def _texts(key: str, table: object) -> dict[str, str]:
 def _traced(
     recording: Recording, name: object, names: tuple[str, ...], groups: Mapping[str, Sequence[str]]
 ) -> tuple[Builder, dict[str, int]]:
-    """Operations and results of ``file.py:name`` beside the recording. The file runs in a process of its own, once.
+    """Trace ``file.py:name`` beside the recording to operations and results, once, in a process of its own.
 
     Raises EquationError, and ``NotTrusted`` for a file that the user has not trusted.
     """
@@ -316,8 +316,8 @@ def _traced(
     try:
         head, arrays = guest.opened()
     except GuestError as error:
-        said = f"{error}" if error.kind == "EquationError" else f"{path} cannot be loaded ({error.kind}: {error})"
-        raise EquationError(f"function: {said}") from error
+        reason = f"{error}" if error.kind == "EquationError" else f"{path} cannot be loaded ({error.kind}: {error})"
+        raise EquationError(f"function: {reason}") from error
     finally:
         guest.end()
     try:

@@ -1,7 +1,7 @@
-"""Twins that are somebody else's program: a Python object from an entry point; FMUs and the emulated instrument too.
+"""Wraps foreign programs as twins: Python objects from an entry point, FMUs, the emulated instrument.
 
-Nothing is known of the inside: effects sit at inputs and outputs only, base parameters are the numbers in
-``[twin.parameters]``, all searched (none is known to be linear).
+Their inside is unknown: effects sit at inputs and outputs only; base parameters are the numbers in
+``[twin.parameters]``, all of which are searched, because none is known to be linear.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remembe
 
 
 class UserTwin(Protocol):
-    """What an entry point of group ``micron.twins`` must give: an object (or class) with this method.
+    """Defines the object (or class) that an entry point of group ``micron.twins`` must return.
 
     ``inputs``: each input (n,) by name, and ``t`` in seconds (n,). ``parameters``: the ``[twin.parameters]`` table.
     Result: each output (n,) by name.
     """
 
     def simulate(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
-        """One free run."""
+        """Make a free run."""
         ...
 
 
@@ -39,7 +39,7 @@ Call = Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]]
 
 @dataclass(frozen=True)
 class OpaqueTwin:
-    """A twin around a function. ``free``: parameters that may be re-fitted, ``fixed``: the others."""
+    """Wraps a function as a twin. ``free``: parameters that may be re-fitted, ``fixed``: the others."""
 
     kind: str
     inputs: tuple[str, ...]
@@ -57,7 +57,7 @@ class OpaqueTwin:
     counted: Counted = ""
     source: str = field(default="", compare=False)
     hold: str = ""
-    """The program is told that its inputs are held ("zero") or straight ("linear") between samples; empty: not told."""
+    """Hold of the inputs that the program is told: "zero" (held) or "linear"; empty: it is not told."""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
@@ -99,14 +99,14 @@ class OpaqueTwin:
             except RecordingError:
                 if as_given:
                     raise
-                # nobody knows which values a stranger's program can take; a search that leaves them turns round
+                # the valid values of a foreign program are unknown; a search that leaves them is reversed
                 return np.full((len(self.outputs), run.t.size), np.nan)
 
         stacked = remember(run.memo, key, make)
         return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
 
     def _checked(self, found: Mapping[str, Array], t: Array) -> Array:
-        """The outputs (outputs, n). RecordingError when one is not there, not finite, or not as long as ``t``."""
+        """Return outputs (outputs, n). Raises RecordingError if one is missing, not finite or not as long as ``t``."""
         rows: list[Array] = []
         for o in self.outputs:
             if o not in found:
@@ -133,7 +133,7 @@ class OpaqueTwin:
 
 
 def opaque_twin(recording: Recording, call: Call, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:
-    """Every number in ``[twin.parameters]`` may be re-fitted, except names in ``fixed``."""
+    """Return the numbers in ``[twin.parameters]`` that may be re-fitted: all but the names in ``fixed``."""
     given = recording.twin.parameters
     free = tuple(
         k for k, v in given.items() if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed
@@ -153,14 +153,14 @@ def opaque_twin(recording: Recording, call: Call, source: str, fixed: Sequence[s
 
 
 def function_twin(recording: Recording, simulate: Simulate) -> OpaqueTwin:
-    """The twin that a function is, which runs in this process."""
+    """Build the twin of a function that runs in this process."""
     call = FunctionRun(simulate, recording.dt, tuple(recording.inputs), tuple(recording.outputs))
     return opaque_twin(recording, call, getattr(simulate, "__name__", "simulate"), recording.twin.fixed)
 
 
 @dataclass(frozen=True)
 class FunctionRun:
-    """One free run of a function per call. RecordingError tells what it raised."""
+    """Makes a free run of a function per call. Raises RecordingError with the function's own exception."""
 
     simulate: Simulate
     dt: float
@@ -170,7 +170,7 @@ class FunctionRun:
     def __call__(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
         name = getattr(self.simulate, "__name__", "simulate")
         try:
-            # copies: the engine keeps its arrays
+            # copies protect the engine's arrays
             found = self.simulate({s: inputs[s].copy() for s in self.inputs}, dict(parameters), self.dt)
         except Exception as error:
             raise RecordingError(f"{name}(inputs, parameters, dt) failed: {type(error).__name__}: {error}") from error
@@ -182,7 +182,7 @@ class FunctionRun:
 
 
 def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
-    """The twin of an entry point (a ``UserTwin`` or its class), in a process of its own. ``NotTrusted`` before that."""
+    """Build the twin of an entry point (a ``UserTwin`` or its class) in a process of its own. Raises ``NotTrusted``."""
     target = str(entry.value)
     require_package(target, recording.path)
     request = {"ask": "open_entry", "name": entry.name, "value": target, "group": plugins.TWINS}
@@ -199,7 +199,7 @@ def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
 
 @dataclass(frozen=True)
 class PackagedRun:
-    """One free run of an entry point's twin per call."""
+    """Makes a free run of an entry point's twin per call."""
 
     guest: GuestProcess
 

@@ -1,7 +1,7 @@
-"""Equations as data: parsed from text or traced from a Python function, run by one compiled interpreter.
+"""Represents equations as data: parsed from text or traced from a Python function, run by a compiled interpreter.
 
-A program is a list of operations on registers. Nothing of it is Python code that could do anything else, so equations
-of a stranger's recording are safe to read, and no new equation has to be compiled.
+A program is a list of operations on registers. It contains no Python code, so equations of an untrusted recording are
+safe to read, and no new equation has to be compiled.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def run_program(operations, registers):
         code = operations[i, 0]
         a = registers[operations[i, 2]]
         b = registers[operations[i, 3]]
-        # arithmetic first: a long chain of comparisons costs more than the operation
+        # arithmetic is tested first: a long chain of comparisons costs more than the operation
         if code < 4:
             if code < 2:
                 v = a + b if code == 0 else a - b

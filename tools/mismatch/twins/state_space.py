@@ -1,7 +1,7 @@
-"""State space: x' = A x + B u, y = C x + D u + y0, re-fitted through its poles and its numerators.
+"""Implements state-space twins: x' = A x + B u, y = C x + D u + y0, re-fitted through poles and numerators.
 
-Re-fitting A, B, C freely has no unique answer (any change of state coordinates gives the same twin). What the
-data can say are the poles and, per input and output, the numerator coefficients: those are the base parameters.
+A free re-fit of A, B, C has no unique answer (any change of state coordinates gives the same twin). The data determine
+the poles and, per input and output, the numerator coefficients: those are the base parameters.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, mode
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
 MAX_ORDER = 64
-"""Modes of a plant at most."""
+"""Largest number of modes of a plant."""
 
 
 @dataclass(frozen=True)
 class Matrices:
-    """The engineer's matrices, checked."""
+    """Holds the engineer's matrices after the checks."""
 
     a: Array
     b: Array
@@ -72,7 +72,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         place[i] = len(parameters)
         if mode.kind == "pair":
             w, z = abs(mode.value), -mode.value.real / abs(mode.value)
-            # what is stable as given stays so
+            # a plant that is stable as given stays stable
             least = 0.0 if z >= 0 else -0.5
             parameters.append(Parameter(f"natural_frequency{tag}", "rad/s", w / 30, w * 30, True, scale=0.01 * w))
             parameters.append(Parameter(f"damping_ratio{tag}", "1", least, 0.9999, scale=max(0.02 * abs(z), 1e-3)))
@@ -114,7 +114,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
                     if worst > 0 and abs(c[r]) > 1e-7 * worst:
                         name = f"numerator_{r}" if single else f"numerator_{r}[{u},{o}]"
                         links.append(Link(len(parameters), o, u, r))
-                        # where two numerators nearly cancel, their sizes say nothing: a trust region as wide as theirs
+                        # nearly cancelling numerators have arbitrary sizes: the trust region is as wide as theirs
                         parameters.append(Parameter(name, unit, scale=max(abs(c[r]), 1e-3 * worst)))
                         begin.append(float(c[r]))
             if direct != 0.0:
@@ -156,7 +156,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         return _text(plant_of(theta), links, theta, inputs, outputs, m)
 
     continuous = list(poles) if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
-    # a mode that swings integrates nothing, however lightly it is damped
+    # an oscillating mode does not integrate, however lightly it is damped
     slowest = min((abs(p) if abs(p.imag) > 1e-9 * abs(p) else -p.real for p in continuous), default=np.inf)
     seen = tuple(first for first, _ in blocks)
     return DynamicTwin(
@@ -240,17 +240,17 @@ def read_matrices(recording: Recording) -> Matrices:
 
 
 def without_constant(m: Matrices, dt: float) -> Matrices:
-    """The same twin with a state that stays 1 (an eigenvalue of zero that no input moves) written as an offset.
+    """Return the twin with a constant state (an eigenvalue of zero that no input moves) written as an offset.
 
-    Such a state is how an affine model is written as a linear one. Its value is a parameter of the twin and no start
-    state: it goes into ``y0``, together with what it drives in the long run. Where it drives an integrator it stays.
+    Such a state expresses an affine model as a linear one. Its value is a parameter of the twin and no start state: it
+    becomes part of ``y0``, together with its steady-state response. A state that drives an integrator is kept.
     """
     s = m.a.shape[0]
     if not s or not np.any(m.x0):
         return m
     zero = 1.0 if m.discrete else 0.0
     size = max(float(np.max(np.abs(m.a))), 1e-300)
-    # rows of A that hold their state, and columns of B that do not move it
+    # rows of A that keep their state constant, and rows of B that do not move it
     still = [
         i
         for i in range(s)
@@ -273,22 +273,23 @@ def without_constant(m: Matrices, dt: float) -> Matrices:
 
 
 def felt_poles(m: Matrices) -> Complex:
-    """Poles (closed under conjugation) of the modes that some output shows: those that an input moves, then those that
-    only start somewhere. A pole that several inputs move through copies of one block counts once.
+    """Return the poles (closed under conjugation) of the observable modes: controllable ones first.
+
+    A pole that several inputs move through copies of one block counts once.
     """
     linked = m.a != 0.0
-    shown = _reached(linked.T, np.any(m.c != 0.0, axis=0))
-    moved = np.zeros_like(shown)
+    observable = _reached(linked.T, np.any(m.c != 0.0, axis=0))
+    moved = np.zeros_like(observable)
     found: list[complex] = []
     for i in range(m.b.shape[1]):
         here = _reached(linked, m.b[:, i] != 0.0)
-        found = _joined(found, _eigenvalues(m.a, here & shown))
+        found = _joined(found, _eigenvalues(m.a, here & observable))
         moved |= here
-    return np.array([*found, *_eigenvalues(m.a, shown & ~moved)], np.complex128)
+    return np.array([*found, *_eigenvalues(m.a, observable & ~moved)], np.complex128)
 
 
 def _reached(linked: NDArray[np.bool_], begin: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """States (s,) that can be reached from those of ``begin``; ``linked[i, j]``: state j moves state i."""
+    """Return a mask (s,) of the states reachable from those of ``begin``; ``linked[i, j]``: state j moves state i."""
     found = begin.copy()
     while True:
         more = found | np.any(linked[:, found], axis=1)
@@ -298,7 +299,7 @@ def _reached(linked: NDArray[np.bool_], begin: NDArray[np.bool_]) -> NDArray[np.
 
 
 def _eigenvalues(a: Array, states: NDArray[np.bool_]) -> list[complex]:
-    """Eigenvalues of these states, block by block: copies of one block give the same figures to the last digit."""
+    """Return the eigenvalues of these states block by block: copies of a block give identical values."""
     left = np.flatnonzero(states).tolist()
     linked = (a != 0.0) | (a != 0.0).T
     out: list[complex] = []
@@ -313,7 +314,7 @@ def _eigenvalues(a: Array, states: NDArray[np.bool_]) -> list[complex]:
 
 
 def _joined(found: list[complex], more: Sequence[complex]) -> list[complex]:
-    """``found`` with those of ``more`` that are not in it yet."""
+    """Return ``found`` with those of ``more`` that are not in it yet."""
     rest = list(found)
     out = list(found)
     for p in more:
@@ -326,15 +327,15 @@ def _joined(found: list[complex], more: Sequence[complex]) -> list[complex]:
 
 
 INTEGRATES = 0.5
-"""Decay over the whole record (nepers) below which a pole integrates: a run then starts afresh in every stretch."""
+"""Decay over the whole record (nepers) below which a pole integrates: a run then restarts in every stretch."""
 SAME_POLE = 1e-6
-"""Relative distance of two poles of different inputs that are one pole."""
+"""Relative distance below which poles of different inputs are the same pole."""
 
 
 def _numerators(m: Matrices, plant: Plant, poles: Complex) -> dict[tuple[int, int], tuple[Array, float]]:
-    """Rows c with c (p - a)^-1 b equal to the given transfer function, per output and input.
+    """Return rows c with c (p - a)^-1 b equal to the given transfer function, per output and input.
 
-    Matched at points of the complex plane beside every pole, where each mode shows most.
+    They are matched at points of the complex plane near every pole, where each mode is strongest.
     """
     s, n = plant.a.shape[0], m.a.shape[0]
     size = float(np.max(np.abs(poles - (1.0 if m.discrete else 0.0)), initial=0.0)) or 1.0
@@ -356,7 +357,7 @@ def _numerators(m: Matrices, plant: Plant, poles: Complex) -> dict[tuple[int, in
 def _rows(
     links: Sequence[Link], theta: Array, inputs: tuple[str, ...], outputs: tuple[str, ...], s: int
 ) -> tuple[Array, Array, Array]:
-    """C over block-diagonal companions (q, s * p), D (q, p), y0 (q,)."""
+    """Return C over block-diagonal companions (q, s * p), D (q, p) and y0 (q,)."""
     c = np.zeros((len(outputs), s * len(inputs)))
     d = np.zeros((len(outputs), len(inputs)))
     y0 = np.zeros(len(outputs))

@@ -1,4 +1,4 @@
-"""Twins without memory: each output is an offset plus scaled inputs. Piezo stack, accelerometer, magnetometer."""
+"""Implements twins without memory (piezo stack, accelerometer, magnetometer): outputs are offset plus scaled input."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ _KINDS: dict[str, tuple[str, str, tuple[Stage, ...]]] = {
 
 
 def static_twin(recording: Recording) -> StaticTwin:
-    """The twin that a recording names, restricted to the axes that were recorded."""
+    """Build the twin that a recording names, restricted to the recorded axes."""
     kind = recording.twin.kind
     offset, scale, chain = _KINDS[kind]
     inputs = tuple(recording.inputs)
@@ -123,7 +123,7 @@ def static_twin(recording: Recording) -> StaticTwin:
             f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {text['hold']!r}"
         )
     for key in text:
-        # at the samples, where it is compared, a twin without memory is the same for either hold
+        # a twin without memory is the same for either hold at the samples, where it is compared
         if key not in known:
             raise RecordingError(
                 f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {', '.join(known)}"
@@ -138,8 +138,10 @@ def gain_and_offset(
     chain: tuple[Stage, ...],
     missing: tuple[float, float] = (np.nan, np.nan),
 ) -> StaticTwin:
-    """The twin whose outputs are each an offset plus a scaled input. ``missing``: offset and scale that are not given
-    (NaN: estimated)."""
+    """Build the twin whose outputs are each an offset plus a scaled input.
+
+    ``missing``: defaults for offset and scale that are not given (NaN: estimated).
+    """
     (offset, scale), text = names, recording.twin.parameters
     inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
     given = tuple(

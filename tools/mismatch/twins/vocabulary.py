@@ -1,4 +1,4 @@
-"""Signals and units of each twin kind (contract, section 2)."""
+"""Defines the signals and units of each twin kind (contract, section 2)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Patterns (full match) with the contract units that are allowed; ``open_ended`` kinds take any signal."""
+    """Maps patterns (full match) to the allowed contract units; ``open_ended`` kinds take any signal."""
 
     inputs: tuple[tuple[str, tuple[str, ...]], ...] = ()
     outputs: tuple[tuple[str, tuple[str, ...]], ...] = ()
     open_ended: bool = False
 
     def units(self, role: Role, signal: str) -> tuple[str, ...] | None:
-        """Allowed contract units; () means any unit, kept as declared; None: no such signal."""
+        """Return the allowed contract units; () means any unit, kept as declared; None: no such signal."""
         if role == "context":
             return CONTEXT_UNITS.get(signal, ())
         if self.open_ended:
@@ -34,7 +34,7 @@ class Vocabulary:
         return None
 
     def known(self, role: Role) -> str:
-        """The signals of a role, for messages."""
+        """Return the signals of a role, for messages."""
         return ", ".join(p for p, _ in (self.inputs if role == "input" else self.outputs))
 
 
@@ -71,12 +71,12 @@ KINDS = MappingProxyType(
 
 
 def user_kinds() -> Mapping[str, object]:
-    """Twins that installed packages offer: kind -> entry point (not loaded)."""
+    """Return the twins that installed packages offer: kind -> entry point (not loaded)."""
     return plugins.offered(plugins.TWINS)
 
 
 def vocabulary(kind: str) -> Vocabulary | None:
-    """The vocabulary of a kind, None if nobody knows it."""
+    """Return the vocabulary of a kind, None for an unknown one."""
     if kind in KINDS:
         return KINDS[kind]
     return Vocabulary(open_ended=True) if kind in user_kinds() else None
