@@ -1,4 +1,4 @@
-"""Effects that lower the residual and are not named, because the data do not bear out a figure that they stand on."""
+"""Withholds effects that lower the residual but have an essential figure that the data do not support."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Values = dict[str, dict[str, ParameterValue]]
 
 
 def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple[Withheld, ...]]:
-    """``sets`` (best first, the last one empty) from the first one on that the data bear out, and what was in front.
+    """Return ``sets`` (best first, the last one empty) from the first supported one on, and the withheld effects.
 
     A set with an effect all of whose sizes may be zero is skipped, and so is every other set with that name.
     """
@@ -45,7 +45,7 @@ def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple
 
 
 def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty) -> Doubt | None:
-    """Why effect ``k`` of a set is not named: a figure, or a size within the tolerances that the recording declares."""
+    """Return why effect ``k`` of a set is not named: a figure, or a size within the recording's tolerances."""
     p, placed = store.problem, s.placed[k]
     doubt = doubt_of(s.fitted, k, values.get(placed.label, {}), unsure)
     if doubt is not None:
@@ -61,13 +61,13 @@ def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty)
 
 
 def entry_of(store: Store, s: Scored, k: int) -> Withheld:
-    """The entry of effect ``k`` of a set that is not likely enough to be named."""
+    """Return the entry of effect ``k`` of a set that is not likely enough to be named."""
     values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
     return _entry(store, s, Doubt(k, "unlikely", ()), values, frozenset())
 
 
 def _entry(store: Store, s: Scored, doubt: Doubt, values: Values, named: frozenset[str]) -> Withheld:
-    """The entry of a doubted effect; ``named``: the names that stand instead."""
+    """Return the entry of a withheld effect; ``named`` are the names that replace it."""
     p, placed = store.problem, s.placed[doubt.k]
     with_it = held_rms(p, s.fitted)
     without = held_rms(p, store.without(s, lambda e: e is placed).fitted)

@@ -1,4 +1,4 @@
-"""The learned constants of the decision. ``micron mismatch calibrate`` alone writes ``constants.json``."""
+"""Loads the learned constants of the decision. Only ``micron mismatch calibrate`` writes ``constants.json``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILE = Path(__file__).with_name("constants.json")
 
 @dataclass(frozen=True)
 class Constants:
-    """What a decision is weighed with.
+    """Holds the constants of a decision.
 
     ``samples``: independent samples that a held-out residual counts for at most (form errors are systematic);
     ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
@@ -37,7 +37,7 @@ class Constants:
 
     @staticmethod
     def of(body: Mapping[str, Any]) -> Constants:
-        """The constants of a parsed file. KeyError when one is missing."""
+        """Return the constants of a parsed file. Raises KeyError if one is missing."""
         return Constants(**{f.name: float(body[f.name]) for f in fields(Constants)})
 
     def to_json(self) -> dict[str, float]:
@@ -45,11 +45,11 @@ class Constants:
 
 
 START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 0.0, 1.0)
-"""Where learning begins, and what the fits that it learns from are searched with: the middle of the ranges that a
+"""Start values of the learning, also used in the searches of its training fits: the middle of the ranges that a
 prototype found on cases of another generator."""
 
 
 @cache
 def learned() -> Constants:
-    """The constants in use."""
+    """Return the constants in use."""
     return Constants.of(json.loads(FILE.read_text())["constants"])

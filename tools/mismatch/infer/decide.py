@@ -1,4 +1,4 @@
-"""From scored sets to an answer: which names, how sure, what is equivalent, and whether that is the whole account."""
+"""Decides on scored sets: the named effects, their probabilities, equivalents, and if the account is complete."""
 
 from __future__ import annotations
 
@@ -21,21 +21,24 @@ from tools.mismatch.infer.density import unpredicted, weigh
 from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
-"""Residual rms of a rival over that of the named set, on held-out samples, within which it fits as well."""
+"""Largest ratio of a rival's held-out residual rms to that of the named set at which the rival fits as well."""
 TESTED, DEEPEST = 6, 30
-"""Sets of names, best first, whose every name is tested; and how many while none has passed."""
+"""Number of sets of names, best first, whose every name is tested; and the number if none has passed so far."""
 CURVE = 12
-"""Parameters that a free curve of a signal is charged for: the columns of a product of a curve and a mover."""
+"""Number of parameters charged for a free curve of a signal: the columns of a product of a curve and a mover."""
 LOUD = 1.5
-"""Mean square of what is left over that of the loudest noise, from which it is more than noise."""
+"""Ratio of the mean square of the residual to that of the loudest noise above which it is more than noise."""
 LEAST_LEAD = 0.1
-"""Share of a residual that a free curve must take to be a rival of effects."""
+"""Least share of a residual that a free curve must explain to be a rival of effects."""
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A set that has ``name`` where the answer has ``instead_of``. ``ratio``: its held-out rms over the answer's on
-    ``output``; ``as_good``: no worse than the margin by a paired test."""
+    """Describes a set that has ``name`` where the answer has ``instead_of``.
+
+    ``ratio`` is its held-out rms over the answer's on ``output``; ``as_good`` is True if a paired test finds it no
+    worse than the margin.
+    """
 
     scored: Scored
     name: str
@@ -47,10 +50,12 @@ class Rival:
 
 @dataclass(frozen=True)
 class Answer:
-    """``chosen`` (the base where nothing is named); ``sure`` per name; ``rivals``; ``strange``: a recorded signal whose
-    free curve is a better account than any set; ``left`` per output; ``floors``: per output the interval of the noise
-    rms; ``whole``: nothing more is left than form errors; ``doubtful``: outputs where the two ends of that interval
-    differ in this; ``withheld``: effects that scored better and are not borne out.
+    """Holds the decision.
+
+    ``chosen`` is the set (the base if nothing is named), ``sure`` the probability per name. ``strange`` is a recorded
+    signal whose free curve is a better account than any set. ``left`` is the rest per output, ``floors`` the interval
+    of the noise rms per output. ``whole`` is True if nothing but form errors is left; ``doubtful`` lists outputs for
+    which both ends of the interval differ in this. ``withheld`` lists effects that scored better without support.
     """
 
     chosen: Scored
@@ -65,8 +70,10 @@ class Answer:
 
 
 def tested(store: Store) -> list[tuple[Scored, float]]:
-    """(set, the weakest test of its names), best first, down to the empty one. A name that is not borne out beside one
-    set may be in all of the first: then it is looked further."""
+    """Return (set, the weakest test of its names), best first, down to the empty set.
+
+    If no set has passed, the search goes deeper, because an unsupported name may be in all of the first sets.
+    """
     out: list[tuple[Scored, float]] = []
     passed, c = 0, store.constants
     for s in store.ranked()[:DEEPEST]:
@@ -78,7 +85,7 @@ def tested(store: Store) -> list[tuple[Scored, float]]:
 
 
 def accepted(store: Store) -> list[Scored]:
-    """Sets of which every name passes its test, best first; at least the empty one."""
+    """Return the sets of which every name passes its test, best first; at least the empty one."""
     c = store.constants
     out = [s for s, z in tested(store) if z > c.least_z]
     return out if any(not s.names for s in out) else [*out, store.base]
@@ -87,8 +94,10 @@ def accepted(store: Store) -> list[Scored]:
 def surenesses(
     names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
 ) -> dict[str, float]:
-    """How sure each of ``names`` is among ``sets`` (names, score): the share of the tempered posterior on sets
-    that have it, on a log odds scale that was calibrated on cases of its own. ``whole``: nothing more is left.
+    """Return the probability of each of ``names`` among ``sets`` (names, score).
+
+    It is the tempered posterior of the sets that have the name, mapped on a log odds scale that was calibrated on
+    separate cases. ``whole``: nothing more is left.
     """
     top = max(v for _, v in sets)
     weights = [(of, math.exp(v - top)) for of, v in sets]
@@ -101,7 +110,7 @@ def surenesses(
 
 
 FLOOR = 1e-6
-"""Probabilities are kept this far from zero and one before their log odds are taken."""
+"""Least distance of a probability from zero and one before its log odds are computed."""
 
 
 def log_odds(p: float) -> float:
@@ -110,18 +119,22 @@ def log_odds(p: float) -> float:
 
 
 def stated(p: float, whole: bool, c: Constants) -> float:
-    """The probability that is stated for a raw one. The raw one is among what is known: where the account is not
-    ``whole``, something else is at work that may have been taken for it."""
+    """Map a raw probability to the stated one.
+
+    The raw one compares known effects only. If the account is not ``whole``, an unknown effect may have been mistaken
+    for the name, and the stated probability is lower.
+    """
     odds = c.sure_offset + c.sure_slope * log_odds(p) - (0.0 if whole else c.sure_open)
     return min(1.0 / (1.0 + math.exp(-odds)), c.most_sure)
 
 
 def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
-    """Sets with one name of ``chosen`` replaced by another, best first: equivalence is a paired test on held-out blocks
-    with a margin, in both directions of which a rival with fewer parameters has no advantage.
+    """Return the sets with one name of ``chosen`` replaced by another, best first.
+
+    Equivalence is a paired test on held-out blocks with a margin; fewer parameters give a rival no advantage.
     """
     p = store.problem
-    mine = held_rms(p, chosen.fitted)
+    chosen_rms = held_rms(p, chosen.fitted)
     out: list[Rival] = []
     for s in store.ranked():
         gone, new = chosen.names - s.names, s.names - chosen.names
@@ -130,9 +143,9 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
         (name,), (instead,) = new, gone
         touched = [o for e in s.placed if e.effect.name == name for o in e.outputs]
         touched += [o for e in chosen.placed if e.effect.name == instead for o in e.outputs]
-        his = held_rms(p, s.fitted)
-        output = max(dict.fromkeys(touched), key=lambda o: his[o] / max(mine[o], 1e-300))
-        ratio = his[output] / max(mine[output], 1e-300)
+        rival_rms = held_rms(p, s.fitted)
+        output = max(dict.fromkeys(touched), key=lambda o: rival_rms[o] / max(chosen_rms[o], 1e-300))
+        ratio = rival_rms[output] / max(chosen_rms[output], 1e-300)
         worse = (chosen.blocks - s.blocks).sum(axis=1)
         spread = float(np.std(worse, ddof=1) / math.sqrt(worse.size)) if worse.size > 1 else math.inf
         within = float(np.mean(worse)) + 1.645 * spread < math.log(MARGIN) * len(set(touched))
@@ -141,20 +154,22 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
 
 
 def candidate_signals(first: Sequence[Trial]) -> frozenset[str]:
-    """Recorded signals that some candidate is about: these have effects of their own."""
+    """Return the recorded signals that some candidate effect uses: these have effects of their own."""
     return frozenset(s for t in first for s in about(t.placed.effect))
 
 
 def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger | None:
-    """The recorded signal, about which no candidate effect is, whose free curve takes most of what ``fitted`` leaves
-    on the output that is furthest from its noise."""
+    """Find the recorded signal whose free curve explains most of the residual of ``fitted``.
+
+    Signals of candidate effects are excluded; the output is the one that is furthest from its noise.
+    """
     found = (lead(problem, fitted, o, least=LEAST_LEAD) for o in problem.twin.outputs)
     leads = [f for f in found if f is not None and f.signal not in known]
     return max(leads, key=lambda f: f.share, default=None)
 
 
 def curve_score(store: Store, s: Scored, found: Stranger) -> float:
-    """The score of ``s`` with a free curve beside it: its gain on blocks that it has not seen, less its price."""
+    """Return the score of ``s`` with a free curve beside it: its gain on held-out blocks, less its price."""
     c = store.constants
     gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * store.counted / store.outputs
     room = store.room(s)[found.output]
@@ -163,8 +178,9 @@ def curve_score(store: Store, s: Scored, found: Stranger) -> float:
 
 @dataclass(frozen=True)
 class Rest:
-    """What a model leaves: ``fit`` with what nothing predicts as its residual, ``left`` what that follows per output,
-    ``floors`` the interval of the noise rms."""
+    """Holds the rest of a model: ``fit`` with the unpredicted part as residual, ``left`` with the signals that it
+    follows per output, ``floors`` with the interval of the noise rms.
+    """
 
     fit: Fit = field(repr=False)
     left: Mapping[str, Leftover]
@@ -172,8 +188,11 @@ class Rest:
 
 
 def rest_of(problem: Problem, fitted: Fit) -> Rest:
-    """What a model leaves. It is real, too, where it is louder than the noise can be, whether it follows anything or
-    not. Readings on a lattice are as loud as its rounding: beside an edge nobody knows the side."""
+    """Return the rest of a model.
+
+    The rest is real if it follows a signal or if it is louder than the noise can be. Readings on a lattice are as loud
+    as its rounding, because beside an edge the side is unknown.
+    """
     rest = unpredicted(problem, fitted)
     left: dict[str, Leftover] = {}
     floors: dict[str, tuple[float, float]] = {}
@@ -189,8 +208,10 @@ def rest_of(problem: Problem, fitted: Fit) -> Rest:
 
 
 def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple[float, float]:
-    """(noise variances that follow something on the output where most does, those that were explained there). With
-    ``doubt`` the noise is as loud as it can be, else as it was estimated."""
+    """Return (noise variances that follow a signal on the worst output, noise variances that were explained there).
+
+    With ``doubt`` the noise is as loud as it can be, else as it was estimated.
+    """
     noise = {o: max(rest.floors[o][1], problem.sigma(o)) if doubt else problem.sigma(o) for o in rest.left}
     real = {o: v.ratio * (problem.sigma(o) / noise[o]) ** 2 for o, v in rest.left.items() if v.real}
     if not real:
@@ -200,23 +221,26 @@ def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple
     return max(real[o] - 1.0, 0.0), max(before - real[o], 0.0)
 
 
-def is_whole(rest: float, taken: float, c: Constants) -> bool:
-    """Whether what is left and follows a signal is no more than the form of what is named may leave."""
-    return rest <= max(c.cut, c.cut_share * taken)
+def is_whole(rest: float, explained: float, c: Constants) -> bool:
+    """Return True if the rest that follows a signal is within the form error of the named effects.
+
+    ``rest`` and ``explained`` are in noise variances.
+    """
+    return rest <= max(c.cut, c.cut_share * explained)
 
 
 def _with_leads(problem: Problem, rest: Rest) -> dict[str, Leftover]:
-    """What is left, led by the recorded condition that most of it follows."""
+    """Return the rest per output, led by the recorded condition that most of it follows."""
     found = {o: lead(problem, rest.fit, o) if v.real else None for o, v in rest.left.items()}
     return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in rest.left.items()}
 
 
 UNLIKELY = 0.5
-"""Share of the probability that the surest name has beside something unexplained, below which a name is not stated."""
+"""Least probability of a name beside an unexplained rest, as a share of the largest that can be stated there."""
 
 
 def decide(store: Store, first: Sequence[Trial]) -> Answer:
-    """The answer of a finished search. ``first``: the candidates that were screened beside the base."""
+    """Decide on a finished search. ``first``: the candidates that were screened beside the base."""
     p, c = store.problem, store.constants
     good, withheld = borne_out(store, accepted(store))
     chosen = good[0]
@@ -225,31 +249,31 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
         chosen, withheld = store.base, ()
     else:
         strange = None
-    said = store.with_events(chosen)
-    rest = rest_of(p, said.fitted)
+    final = store.with_events(chosen)
+    rest = rest_of(p, final.fitted)
     if strange is not None:
         left = {o: v.led_by(strange) if o == strange.output else v for o, v in rest.left.items()}
     else:
         left = _with_leads(p, rest)
     quiet, loud = (is_whole(*worst_left(p, store.base.fitted, rest, doubt=doubt), c) for doubt in (False, True))
-    # with nothing named the doubt is what is said
-    whole = strange is None and (loud if said.placed else quiet)
+    # without a named effect the noise as estimated decides, so that the doubt is reported
+    whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
     sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
     sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
     least = 0.0 if whole else UNLIKELY * stated(1.0, False, c)
     unlikely = {name for name, v in sure.items() if v < least}
     if unlikely:
-        withheld += tuple(entry_of(store, said, k) for k, e in enumerate(said.placed) if e.effect.name in unlikely)
-        said = store.without(said, lambda e: e.effect.name in unlikely)
+        withheld += tuple(entry_of(store, final, k) for k, e in enumerate(final.placed) if e.effect.name in unlikely)
+        final = store.without(final, lambda e: e.effect.name in unlikely)
         chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
-        rest = rest_of(p, said.fitted)
+        rest = rest_of(p, final.fitted)
         left = _with_leads(p, rest)
-    return Answer(said, sure, rivals_of(store, chosen), strange, left, rest.floors, whole, doubtful, withheld)
+    return Answer(final, sure, rivals_of(store, chosen), strange, left, rest.floors, whole, doubtful, withheld)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:
-    """Whether re-fitted base parameters predict better than the given ones by more than their price."""
+    """Return True if re-fitted base parameters predict better than the given ones by more than their price."""
     p, c = store.problem, store.constants
     before = float(np.mean([np.mean(w.density[p.held_rows]) for w in weigh(p, raw).values()]))
     gain = store.counted * (float(np.mean([*store.base.density.values()])) - before)

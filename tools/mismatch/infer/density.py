@@ -1,7 +1,6 @@
-"""How well a fitted model predicts samples that no fit has seen: a Student-t density of the free run's residual.
+"""Measures how well a fitted model predicts held-out samples: a Student-t density of the free run's residual.
 
-The scale is the one that maximises the density on the fitted samples, so that a fit that only follows its own samples
-pays for it on the others.
+The scale maximises the density on the fitted samples, so that overfitting lowers the density on the others.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ from tools.mismatch.placed import Placed
 Array = NDArray[np.float64]
 
 DEGREES = 5.0
-"""Degrees of freedom: tails that heavy-tailed noise has."""
+"""Degrees of freedom of the density, as heavy-tailed noise has them."""
 _CONSTANT = math.lgamma((DEGREES + 1) / 2) - math.lgamma(DEGREES / 2) - 0.5 * math.log(DEGREES * math.pi)
 NORMAL_SCALE = 0.8527
-"""Scale of the best such density of normal noise of unit rms (by quadrature)."""
+"""Scale of the Student-t density that fits normal noise of unit rms best (by quadrature)."""
 NORMAL = -1.4371
-"""Mean log density of normal noise of unit rms under the best such density (by quadrature)."""
+"""Mean log density of normal noise of unit rms under the best Student-t density (by quadrature)."""
 LATTICE = 0.1
-"""Least scale in units of the lattice that readings sit on: beside an edge a reading may fall on either side."""
+"""Least scale in steps of the lattice of readings: beside an edge a reading may fall on either side."""
 LEAST = 0.05
-"""Least scale in units of the noise floor: a residual that is exactly zero is no infinite evidence."""
+"""Least scale in units of the noise floor. It keeps the evidence of an exactly zero residual finite."""
 
 
 def student_scale(r: Array, least: float) -> float:
-    """Maximum-likelihood scale of centred Student-t samples ``r`` (n,) (Lange et al. 1989)."""
+    """Return the maximum-likelihood scale of centred Student-t samples ``r`` (n,) (Lange et al. 1989)."""
     s = max(1.4826 * float(np.median(np.abs(r))), least)
     for _ in range(12):
         weight = (DEGREES + 1) / (DEGREES + (r / s) ** 2)
@@ -45,12 +44,12 @@ def student_scale(r: Array, least: float) -> float:
 
 
 def student_log_density(r: Array, scale: float) -> Array:
-    """Log density (n,) of each of ``r``, in nats."""
+    """Return the log density (n,) of each of ``r``, in nats."""
     return _CONSTANT - math.log(scale) - 0.5 * (DEGREES + 1) * np.log1p((r / scale) ** 2 / DEGREES)
 
 
 def undone(problem: Problem, fitted: Fit, output: str, placed: Sequence[int]) -> Array:
-    """The residual (m,) of ``output`` with the fitted courses of the effects ``placed`` put back into it."""
+    """Return the residual (m,) of ``output`` with the fitted courses of the effects ``placed`` added back."""
     model, theta = fitted.model, fitted.theta.copy()
     for k in placed:
         _, weights = model.slices(k)
@@ -59,10 +58,10 @@ def undone(problem: Problem, fitted: Fit, output: str, placed: Sequence[int]) ->
 
 
 def prediction(problem: Problem, fitted: Fit, output: str) -> tuple[Array, Array]:
-    """Errors of the prediction of every sample (m,), and their standard deviations up to a common factor (m,).
+    """Return the prediction errors of all samples (m,), and their standard deviations up to a common factor (m,).
 
-    The free run alone predicts, unless an effect of the set is noise with a law of its own: then what the samples
-    before a sample say of it by that law is part of its prediction.
+    The free run alone predicts, unless an effect of the set is noise with a predictor (``Effect.predict``): then its
+    one-step prediction from the previous samples is included.
     """
     model = fitted.model
     laws = [k for k, p in enumerate(model.placed) if p.effect.predict is not None and output in p.outputs]
@@ -77,14 +76,16 @@ def prediction(problem: Problem, fitted: Fit, output: str) -> tuple[Array, Array
     believed[problem.held_rows] = True
     usual = ~model.excused(problem.view, output)
     gap_s = np.diff(problem.index, prepend=problem.index[:1]) * problem.recording.dt
-    # noise of the instrument that runs on from sample to sample is not the law's to predict
+    # the predictor must not take credit for coloured noise of the instrument
     least = problem.sigma(output)
     return law(undone(problem, fitted, output, laws), gap_s, believed & usual, learned & usual, least)
 
 
 def unpredicted(problem: Problem, fitted: Fit) -> Fit:
-    """``fitted`` with what nothing predicts as its residual: by the law of its noise where it has one, and without the
-    samples that are events of their own."""
+    """Return ``fitted`` with its unpredicted part as residual.
+
+    One-step predictions of effects that are noise are removed, and so are samples that are events.
+    """
     left: dict[str, Array] = {}
     for o in problem.twin.outputs:
         error, deviation = prediction(problem, fitted, o)
@@ -93,12 +94,14 @@ def unpredicted(problem: Problem, fitted: Fit) -> Fit:
 
 
 COLOUR = 8
-"""Samples before a sample from which what a law could not predict is tried once more."""
+"""Order of the autoregression that tests the prediction errors for remaining colour."""
 
 
 def predictable(problem: Problem, e: Array) -> float:
-    """Nats per held-out sample by which an autoregression, learned on the fitted samples, predicts what the law of
-    noise could not: innovations ``e`` (m,) are white where the law holds."""
+    """Return the nats per held-out sample by which an autoregression improves the prediction errors ``e`` (m,).
+
+    It is learned on the fitted samples. Innovations are white if the law of the noise holds.
+    """
     limit = 6.0 * robust_scale(e[problem.fit_rows], 1e-300)
     e = np.clip(e, -limit, limit)
     learned = np.zeros(e.size, np.bool_)
@@ -109,11 +112,11 @@ def predictable(problem: Problem, e: Array) -> float:
 
 
 KNOTS = 10
-"""Knots of the curve of a recorded signal that what is independent must not follow."""
+"""Number of knots of the curve of a recorded signal that an independent effect must not follow."""
 
 
 def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
-    """Curves (m, k) of every input and condition, and of what is simulated of ``output``."""
+    """Return curves (m, k) of every input and condition, and of the simulated ``output``."""
     r = problem.recording
     signals = [x[problem.index] for of in (r.inputs, r.context) for x in of.values()]
     signals.append(problem.measured[output] - fitted.residual[output])
@@ -121,7 +124,7 @@ def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
 
 
 def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
-    """What an autoregression, learned on the samples ``learned``, does not predict of ``e`` (both (m,))."""
+    """Return the innovations (m,) of ``e`` by an autoregression that is learned on the samples ``learned`` (m,)."""
     limit = 6.0 * robust_scale(e[learned], 1e-300)
     clipped = np.clip(e, -limit, limit)
     past = np.column_stack([np.concatenate([np.zeros(k), clipped[:-k]]) for k in range(1, COLOUR + 1)])
@@ -129,9 +132,11 @@ def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
 
 
 def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed], int]) -> bool:
-    """Whether a curve of one recorded signal, with the colour of what it leaves, says more about ``output`` than the
-    effects there which depend on nothing that is recorded (a walk, steps, a drift in time), each with its price
-    (Schwarz 1978). ``figures``: how many numbers an effect brings."""
+    """Return True if a curve of a recorded signal explains ``output`` better than its signal-independent effects.
+
+    Such effects are a walk, steps and a drift in time. The curve counts with the colour of its residual, and each
+    alternative pays for its parameters (Schwarz 1978). ``figures`` returns the number of parameters of an effect.
+    """
     own = [
         k
         for k, p in enumerate(fitted.model.placed)
@@ -166,12 +171,14 @@ def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Plac
 
 
 TAILS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
-"""Degrees of freedom of Student-t tails that noise without events may have."""
+"""Degrees of freedom of the Student-t tails of noise without events that are tried."""
 
 
 def gain_of_events(r: Array, events: NDArray[np.bool_], span: float, least: float) -> float:
-    """Nats by which residuals ``r`` (n,) are likelier as a mixture of noise and of ``events`` (n,), which are anywhere
-    within their own largest size and within ``span``, than as noise alone, each with the tails that suit it best."""
+    """Return the nats by which ``r`` (n,) is more likely as a mixture of noise and ``events`` (n,) than as noise.
+
+    Events are uniform within their own largest size and within ``span``; each hypothesis has its best tails.
+    """
     share = float(np.mean(events))
     if not 0.0 < share < 1.0:
         return 0.0
@@ -193,9 +200,11 @@ def gain_of_events(r: Array, events: NDArray[np.bool_], span: float, least: floa
 
 @dataclass(frozen=True)
 class Weighed:
-    """``density`` (m,) log density of every sample of an output; of a law of noise the share of samples that it is free
-    to follow (``free``: trace of its smoother, Harvey 1989, section 4.5), and what an autoregression predicts of what
-    it could not (``predictable``, nats per sample). Both are 0 without one."""
+    """Holds the log ``density`` (m,) of the samples of an output, and the figures of an effect that is noise.
+
+    ``free`` is the share of samples that the effect is free to follow (trace of its smoother, Harvey 1989, section
+    4.5); ``predictable`` is the gain of an autoregression on its errors, nats per sample. Both are 0 without one.
+    """
 
     density: Array
     free: float = 0.0
@@ -203,11 +212,11 @@ class Weighed:
 
 
 def weigh(problem: Problem, fitted: Fit) -> dict[str, Weighed]:
-    """The log densities of all samples of the view, per output.
+    """Return the log densities of all samples of the view, per output.
 
-    A sample that an effect takes as its own event is predicted by nothing but the range of the recording: it pays the
-    density of a uniform distribution over it, and what it takes to say that it is an event; the others pay what it
-    takes to say that they are none (a mixture: R. K. Pearson, Mining Imperfect Data, 2005, section 3.2).
+    A sample that an effect claims as an event has the density of a uniform distribution over the range of the
+    recording and the log probability of an event; the others have that of no event (a mixture: R. K. Pearson, Mining
+    Imperfect Data, 2005, section 3.2).
     """
     out: dict[str, Weighed] = {}
     best = best_log_density(problem)
@@ -228,7 +237,7 @@ def weigh(problem: Problem, fitted: Fit) -> dict[str, Weighed]:
             d = np.where(excused, event, d + math.log(max(1.0 - share, 1e-300)))
         free = more = 0.0
         if lawful:
-            # what a law makes of the colour of the instrument's own noise is no credit to it
+            # a predictor gets no credit for the colour of the instrument's own noise
             d = d - max(float(np.mean(d[problem.held_rows])) - best[o], 0.0)
             gain = 1.0 - deviation[problem.held_rows] ** -2.0
             free = float(np.mean(gain / (2.0 - gain)))
@@ -238,12 +247,12 @@ def weigh(problem: Problem, fitted: Fit) -> dict[str, Weighed]:
 
 
 def best_log_density(problem: Problem) -> Mapping[str, float]:
-    """The mean log density per output that normal noise at the floor would have: no model predicts much better."""
+    """Return the mean log density per output of normal noise at the floor, which hardly any model exceeds."""
     return {o: NORMAL - math.log(max(problem.sigma(o), 1e-300)) for o in problem.twin.outputs}
 
 
 def exact_log_density(problem: Problem) -> Mapping[str, float]:
-    """The log density per output that readings on a lattice would have whose every value is predicted."""
+    """Return the log density per output of readings on a lattice of which every value is predicted."""
     out: dict[str, float] = {}
     for o in problem.twin.outputs:
         floor = problem.floors[o]

@@ -1,4 +1,4 @@
-"""From a recording to a report by way of one score. The report is the same object that the other engine makes."""
+"""Diagnoses a recording: prepares it, searches, decides by the score, and assembles the report."""
 
 from __future__ import annotations
 
@@ -33,8 +33,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Inferred:
-    """A recording made ready, and what the search found on it: everything that a decision needs. ``whole``: with the
-    sealed end that neither knows of; ``unsealed``: why there is none."""
+    """Holds a prepared recording and the result of the search: everything that a decision needs.
+
+    ``whole`` is the recording with the sealed end, which neither has used; ``unsealed`` is the reason for none.
+    """
 
     posed: Posed
     found: Found
@@ -46,7 +48,7 @@ def infer(
     recording: Recording, constants: Constants, *, held_out: float = 0.3, seed: int = 0, jobs: int = 1,
     progress: Progress | None = None, effects: Iterable[Effect] | None = None,
 ) -> Inferred:  # fmt: skip
-    """Prepare and search; no decision yet. The linear algebra uses one thread."""
+    """Prepare the recording and search, without a decision. The linear algebra uses one thread."""
     kept, unsealed = seal(recording)
     with threadpool_limits(1):
         posed = pose(kept, held_out, seed, jobs, progress, effects, partial(look, constants, jobs, progress))
@@ -58,7 +60,7 @@ def diagnose(
     recording: Recording, *, held_out: float = 0.3, seed: int = 0, jobs: int = 2, progress: Progress | None = None,
     effects: Iterable[Effect] | None = None, constants: Constants | None = None,
 ) -> Report:  # fmt: skip
-    """Locate the mismatch, name the physics and say how sure that is, with the learned constants unless given."""
+    """Locate the mismatch, name the physics and state its probability; ``constants`` default to the learned ones."""
     began = time.perf_counter()
     find = partial(
         infer, constants=constants or learned(), held_out=held_out, seed=seed, jobs=jobs, progress=progress,
@@ -76,8 +78,10 @@ def diagnose(
 
 
 def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
-    """Whether the answer has a delay of half a sample where the data did not tell what the inputs do between their
-    samples: held inputs explain as much, and no machine has such a delay."""
+    """Return True if the answer has a delay of half a sample and the data did not determine the hold of the inputs.
+
+    Held inputs explain as much, and no machine has such a delay.
+    """
     hold, store = inferred.posed.hold, inferred.found.store
     if hold is None or hold.how != "assumed" or not answer.chosen.placed:
         return False
@@ -85,7 +89,7 @@ def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
 
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:
-    """The report of an answer."""
+    """Return the report of an answer."""
     posed, store = inferred.posed, inferred.found.store
     decision = verdict_of(posed, store, answer)
     named = decision.verdict in ("missing_physics", "unexplained")
@@ -101,7 +105,7 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
     return replace(
         report,
         fit=replace(report.fit, sealed=sealed),
-        # the likeliest first; of equals the one that takes more
+        # the most likely first; of equals the one that explains more
         physics=tuple(sorted(report.physics, key=lambda p: -effect_size(store, chosen, p.name))),
         alternatives=alternatives_of(store, answer) if chosen.placed else (),
         equivalent=equivalents_of(store, answer) if chosen.placed else (),
@@ -109,8 +113,10 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
 
 
 def least_named(store: Store) -> LeastNamed:
-    """What an effect must show to be named, as the limits of detection are computed: its test, and the noise variances
-    that pay for it and are more than the form of others may leave."""
+    """Return the thresholds of naming for the limits of detection.
+
+    They are the test of the effect, and the noise variances that pay its price and exceed the form error of others.
+    """
     c = store.constants
     pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / store.counted)
     least = max(pays, c.cut)
@@ -118,7 +124,7 @@ def least_named(store: Store) -> LeastNamed:
 
 
 def effect_size(store: Store, chosen: Scored, name: str) -> float:
-    """Nats that a name brings to a set."""
+    """Return the nats that a name adds to a set."""
     small = store.without(chosen, lambda p: p.effect.name == name)
     return sum(chosen.density.values()) - sum(small.density.values())
 
@@ -131,7 +137,7 @@ def alternatives_of(store: Store, answer: Answer) -> tuple[Alternative, ...]:
 
 
 def equivalents_of(store: Store, answer: Answer) -> tuple[Equivalent, ...]:
-    """Names that this recording cannot tell from a named one, with the recording that would."""
+    """Return the names that this recording cannot distinguish from a named one, with the recording that would."""
     effects = {p.effect.name: p.effect for s in store.sets.values() for p in s.placed}
     out: list[Equivalent] = []
     for name in sorted(answer.chosen.names):
@@ -142,7 +148,7 @@ def equivalents_of(store: Store, answer: Answer) -> tuple[Equivalent, ...]:
 
 
 def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
-    """The verdict. Differences within a declared tolerance count as none."""
+    """Return the verdict. Differences within a declared tolerance do not count."""
     problem, raw, base, fitted = store.problem, posed.raw, store.base.fitted, answer.chosen.fitted
     floors = dict(answer.floors)
     if all(within_tolerance(problem, raw).values()):
@@ -153,7 +159,7 @@ def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
         meaning = "floor_doubtful" if answer.doubtful else meaning_of(problem, dict(answer.left), trouble)
         return Decision("unexplained", p, meaning, trouble, floors, answer.doubtful)
     if answer.chosen.placed:
-        # corrected for every candidate that was looked at (Bonferroni)
+        # corrected for the number of screened candidates (Bonferroni)
         p = min(1.0, float(norm.sf(store.least_z(answer.chosen))) * max(len(store.seen), 1))
         return Decision("missing_physics", p, "", (), floors, answer.doubtful)
     return Decision("recalibrate" if recalibrated(store, raw) else "agrees", 1.0, "", (), floors)

@@ -1,6 +1,4 @@
-"""The end of a recording, kept sealed: nothing that fits, chooses or estimates noise reads it. It is scored once, when
-everything is decided.
-"""
+"""Seals the end of a recording: no fit, choice or noise estimate reads it, and it is scored once after the decision."""
 
 from __future__ import annotations
 
@@ -19,15 +17,15 @@ from tools.mismatch.engine.split import Split, cut, shot
 from tools.mismatch.recording import Recording
 
 SHARE = 0.1
-"""Share of a recording that is sealed: its end, since a twin is for what comes next."""
+"""Share of a recording that is sealed: its end, because a twin is used for later data."""
 LEAST = 200
-"""Samples below which a sealed part would say nothing of the rms that is worth the samples: that is known to 5 %."""
+"""Least number of samples of a sealed part: they determine its rms to 5 %."""
 PIECES = 8
-"""Stretches of the sealed part, for a twin that starts every stretch afresh."""
+"""Number of stretches of the sealed part, for a twin that restarts in every stretch."""
 
 
 def seal(recording: Recording) -> tuple[Recording, str]:
-    """The recording without its sealed end; or all of it, and why nothing is sealed (``Sealed.why``)."""
+    """Return the recording without its sealed end; or all of it, and why nothing is sealed (``Sealed.why``)."""
     if recording.parts:
         return recording, "several_recordings"
     if ranges_of(recording) is not None or recording.split.test is not None:
@@ -39,7 +37,7 @@ def seal(recording: Recording) -> tuple[Recording, str]:
 
 
 def shortened(recording: Recording, samples: int) -> Recording:
-    """The first ``samples`` of a recording."""
+    """Return the first ``samples`` of a recording."""
     return replace(
         recording,
         t=recording.t[:samples],
@@ -51,8 +49,9 @@ def shortened(recording: Recording, samples: int) -> Recording:
 
 
 def score_sealed(whole: Recording, posed: Posed, base: Fit, fitted: Fit) -> Sealed:
-    """The score of the end of ``whole``, of which ``posed`` is the beginning: one run on from what was fitted, with
-    the effects that will be there again (no events).
+    """Score the end of ``whole``, of which ``posed`` is the beginning.
+
+    The run continues from the fitted part, with the recurring effects (no events).
     """
     problem, start = posed.problem, posed.problem.recording.n
     full = replace(

@@ -1,4 +1,4 @@
-"""Search over sets of effects: add one, add it everywhere, drop, swap; a beam of three, screened by the score test."""
+"""Searches sets of effects: add one, add it everywhere, drop, swap; a beam of three, screened by the score test."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from tools.mismatch.placed import Placed
 Progress = Callable[[str, int, int], None]
 
 BEAM = 3
-"""Sets that are extended at a time."""
+"""Number of sets that are extended at a time."""
 MOVES = 5
-"""Sets that are extended at most, besides the base: each costs a screen of the whole vocabulary."""
+"""Largest number of extended sets besides the base; each costs a screen of the whole vocabulary."""
 SWAPS = 2
-"""Rounds in which every effect of the best set is taken out and what fits beside the others is looked for."""
+"""Number of rounds in which every effect of the best set is removed and a better one is sought beside the others."""
 RIVALS = 3
-"""Names that are tried in place of each name of the best set, and beside it on each output that it leaves alone."""
+"""Number of names tried in place of each name of the best set, and beside it on each output that it does not change."""
 FITS, FITS_LATER = (3, 6), (2, 4)
-"""(Least, most) candidates of each kind per output that the screen lets through to a fit, from the base and later."""
+"""(Least, most) candidates of each kind per output that the screen passes to a fit, from the base and later."""
 HALF = 0.5
-"""A set is extended if it gains at least this share of what the best set gains over the base."""
+"""Least gain over the base of a set that is extended, as a share of the best set's gain."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a search leaves: the ``store``, and the screened candidates beside the base (``first``)."""
+    """Holds the result of a search: the ``store``, and the screened candidates beside the base (``first``)."""
 
     store: Store
     first: tuple[Trial, ...]
 
 
 PATIENCE = 2
-"""Sets extended in a row without a better set than before, after which nothing more is extended."""
+"""Number of consecutive extensions without a better set after which the search stops."""
 WORTH_REFINING = 0.2
-"""Share of the gain of the best candidate's one step that the coarse fit of a candidate must have to be refined. It is
-below ``HALF``, since a coarse fit may end far from the best one."""
+"""Least gain of a coarse fit that is refined, as a share of the gain of the best candidate's single step. It is below
+``HALF``, since a coarse fit may end far from the best one."""
 
 
 class Search:
-    """One search. ``stride`` thins the rows of a candidate's fit."""
+    """Searches the sets of effects of a problem. ``stride`` thins the rows of a candidate's fit."""
 
     def __init__(
         self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
@@ -69,7 +69,7 @@ class Search:
         self.first: tuple[Trial, ...] = ()
 
     def run(self) -> Found:
-        """Extend until nothing can gain, then swap; refine what the decision is between."""
+        """Extend until nothing can gain, then swap; refine the sets between which the decision is made."""
         self.expand(self.store.base)
         self.combine()
         self.pair()
@@ -93,8 +93,9 @@ class Search:
         return Found(self.store, self.first)
 
     def combine(self) -> None:
-        """The best single effect of each output put together, the best first, while the score grows: where outputs
-        share nothing, what is missing on one says nothing about another, and no order of moves need find it.
+        """Join the best single effects of the outputs, the best first, while the score grows.
+
+        If outputs share nothing, the missing effects are independent, and extending one by one may not find them all.
         """
         if not self.problem.twin.apart or len(self.problem.twin.outputs) < 2:
             return
@@ -128,20 +129,21 @@ class Search:
                 self.expand(s)
 
     def gain_before_prices(self, s: Scored) -> float:
-        """Nats that a set gains over the base before its names and parameters are paid for."""
+        """Return the nats that a set gains over the base before the prices of its names and parameters."""
         return self.store.counted * (s.mean_density - self.store.base.mean_density)
 
     def swap(self, best: Scored) -> None:
-        """Every name of ``best`` replaced by those that do about as well alone on the same outputs: beside the base one
-        of two likenesses is extended, and the other has to be seen in its place.
+        """Replace every name of ``best`` by those that do about as well alone on the same outputs.
+
+        Beside the base only one of two similar effects is extended; the other must be tried in its place.
         """
         alone = [s for s in self.store.sets.values() if len(s.placed) == 1 and s.proper]
         alone.sort(key=lambda s: (-self.store.score(s), sorted(s.names)))
         for name in sorted(best.names):
             outputs = {o for p in best.placed if p.effect.name == name for o in p.outputs}
             here = [s for s in alone if outputs & set(s.placed[0].outputs)]
-            mine = max((self.store.score(s) for s in here if name in s.names), default=np.inf)
-            near = [s for s in here if self.store.score(s) > mine - 2.0 * self.store.constants.per_name]
+            own_score = max((self.store.score(s) for s in here if name in s.names), default=np.inf)
+            near = [s for s in here if self.store.score(s) > own_score - 2.0 * self.store.constants.per_name]
             rest = self.store.without(best, lambda p, n=name: p.effect.name == n)
             for rival in list(dict.fromkeys(n for s in near for n in s.names if n not in best.names))[:RIVALS]:
                 grown, left = rest, set(outputs)
@@ -169,23 +171,25 @@ class Search:
                 return
 
     def can_be_beaten(self, best: Scored) -> bool:
-        """Whether a set with one more name may score more than ``best``: noise at its floor is as good as it gets."""
+        """Return True if a set with one more name may score more than ``best``; the noise floor bounds the score."""
         c = self.store.constants
         return self.most_gain(best) + c.per_parameter * (best.parameters - 1) > c.per_name
 
     def can_gain(self, s: Scored, best: float) -> bool:
-        """Whether ``s`` with one more name can score more than ``best`` if it explains everything down to the noise."""
+        """Return True if ``s`` with one more name can score more than ``best`` by explaining all down to the noise."""
         c = self.store.constants
         return self.store.score(s) + self.most_gain(s) - c.per_name - c.per_parameter > best
 
     def most_gain(self, s: Scored) -> float:
-        """Nats that one more name brings at most: on the output with most room, or on all of them in their mean. Small
-        rooms of many outputs are errors of their noise floors, and no name."""
+        """Return the most nats that one more name can add: on the output with most room, or on all in their mean.
+
+        Small rooms on many outputs are errors of their noise floors and support no name.
+        """
         room = self.store.room(s)
         return max(max(room.values()), sum(room.values()) * self.store.outputs / len(room))
 
     def expand(self, s: Scored) -> None:
-        """Every candidate beside ``s`` screened, the promising ones fitted and put into the store."""
+        """Screen every candidate beside ``s``, fit the promising ones and put them into the store."""
         self.expanded.add(s.key)
         room, least = self.store.room(s), self.store.constants.per_parameter
         pool = [
@@ -211,7 +215,7 @@ class Search:
             self.spread(s, children)
 
     def spread(self, s: Scored, children: Sequence[tuple[Scored, Placed]]) -> None:
-        """The two best new names on every other output where the same effect fits well alone: one move, one name."""
+        """Place the two best new names on every other output where the same effect fits well alone, in one move."""
         best = [c for c in self.store.ranked([c for c, _ in children]) if c.names - s.names][:2]
         for child in best:
             (name,) = child.names - s.names
@@ -223,8 +227,8 @@ class Search:
             )
             free = self.store.constants.per_name
             for c, place in others:
-                taken = {o for p in grown.placed if p.effect.name == name for o in p.outputs}
-                if taken & set(place.outputs) or self.store.score(c) + free <= own:
+                covered = {o for p in grown.placed if p.effect.name == name for o in p.outputs}
+                if covered & set(place.outputs) or self.store.score(c) + free <= own:
                     continue
                 grown = self.store.with_one(grown, place)
 
@@ -233,20 +237,22 @@ def search(
     problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
     jobs: int = 1, progress: Progress | None = None,
 ) -> Found:  # fmt: skip
-    """The sets of effects worth a decision, fitted and scored. ``base``: the recalibrated twin."""
+    """Find, fit and score the sets of effects for a decision. ``base``: the recalibrated twin."""
     with np.errstate(all="ignore"):
         return Search(problem, base, effects, constants, jobs=jobs, progress=progress).run()
 
 
 NOMINATED = 8
-"""Sets of a search on a part of a recording, best first, whose names are tried on the whole."""
+"""Number of sets of a search on a part of a recording, best first, whose names are tried on the whole."""
 
 
 def look(
     constants: Constants, jobs: int, progress: Progress | None, problem: Problem, base: Fit, allowed: tuple[Effect, ...]
 ) -> tuple[set[str], list[Hint]]:
-    """The names and what they were found to be in the best sets of a short search on a part of a recording, as
-    ``nominated`` asks. Events are tried on the whole in any case: a part may have none."""
+    """Return the names in the best sets of a short search on a part of a recording, with their fits as hints.
+
+    ``nominated`` calls it. Events are tried on the whole in any case, because a part may have none.
+    """
     with np.errstate(all="ignore"):
         store = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2).run().store
     best = [s for s in store.ranked() if s.names][:NOMINATED]

@@ -1,4 +1,4 @@
-"""Sets of effects that were fitted and scored, each once, by what they consist of."""
+"""Stores sets of effects that were fitted and scored, each once."""
 
 from __future__ import annotations
 
@@ -35,21 +35,23 @@ Key = frozenset[Part]
 
 
 def part_of(placed: Placed) -> Part:
-    """What tells an effect at its place from others; what it read off the data does not."""
+    """Return the key of an effect at its place; settings that were read off the data are not part of it."""
     return (*placed.effect.form, placed.site, placed.target)
 
 
 def key_of(placed: Sequence[Placed]) -> Key:
-    """The set that these effects make, in whatever order."""
+    """Return the key of the set of these effects, independent of their order."""
     return frozenset(part_of(p) for p in placed)
 
 
 @dataclass(frozen=True)
 class Scored:
-    """One set with its joint fit. ``density``: mean log density of held-out samples per output; ``blocks``
-    (blocks, outputs) the same per held-out block; ``parameters``: how many numbers the effects bring; ``proper``: the
-    fit stayed within reach and every effect within what its physics can be; ``outputs``: how many outputs are
-    averaged over (``Store.outputs``).
+    """Holds a set with its joint fit.
+
+    ``density`` is the mean log density of held-out samples per output, ``blocks`` (blocks, outputs) the same per
+    held-out block; ``parameters`` is the number of parameters of the effects. ``proper`` is True if the fit did not
+    diverge and every effect is within its physical range. ``outputs`` is the number of outputs in the mean
+    (``Store.outputs``).
     """
 
     key: Key
@@ -66,7 +68,7 @@ class Scored:
 
     @property
     def mean_density(self) -> float:
-        """Nats per held-out sample, averaged over the outputs that have something to explain."""
+        """Return the nats per held-out sample, averaged over the outputs that have something to explain."""
         return sum(self.density.values()) / self.outputs
 
     @property
@@ -74,19 +76,21 @@ class Scored:
         return self.fitted.model.placed
 
     def score(self, c: Constants, counted: float) -> float:
-        """Nats: the tempered log density (Miller and Dunson 2019: a likelihood raised to a power below one, because the
-        form of a model is never quite right) less the prices of names and parameters. ``counted``: samples that a
-        residual counts for.
+        """Return the score in nats: the tempered log density less the prices of names and parameters.
 
-        The mean over the outputs that have something to explain counts: what the form of an effect leaves on one of
-        them it leaves on all.
+        The likelihood is raised to a power below one, because the form of a model is never exact (Miller and Dunson
+        2019). ``counted`` is the number of samples that a residual counts for. The density is the mean over the outputs
+        that have something to explain, because an error of form on one of them is repeated on all.
         """
         return counted * self.mean_density - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
 class Store:
-    """Every set that a search has fitted. ``seen``: how the screen saw an effect at its place, by its part;
-    ``eventful``: sets with the events that were found beside them, by the set's key."""
+    """Holds every set that a search has fitted.
+
+    ``seen`` maps parts to the screened candidates; ``eventful`` maps a set's key to the set with the events that were
+    found beside it.
+    """
 
     def __init__(self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = ()) -> None:
         self.problem = problem
@@ -94,7 +98,7 @@ class Store:
         self.constants = constants
         held = int(problem.held_rows.size)
         self.counted = min(constants.samples * recordings_held(problem), float(held))
-        """Samples that a held-out residual counts for: form errors are systematic within one recording."""
+        """Number of samples that a held-out residual counts for; form errors are systematic within a recording."""
         self.sets: dict[Key, Scored] = {}
         self.seen: dict[Part, Candidate] = {}
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
@@ -106,7 +110,7 @@ class Store:
         self.base = self.put(base)
 
     def put(self, fitted: Fit) -> Scored:
-        """The fit scored. Of two fits of one set the better one is kept."""
+        """Score a fit. Of two fits of a set the better one is kept."""
         scored = self.scored(fitted)
         old = self.sets.get(scored.key)
         if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
@@ -114,7 +118,7 @@ class Store:
         return self.sets[scored.key]
 
     def scored(self, fitted: Fit) -> Scored:
-        """The fit scored."""
+        """Score a fit without storing it."""
         p = self.problem
         every = weigh(p, fitted)
         mean = {o: float(np.mean(w.density[p.held_rows])) for o, w in every.items()}
@@ -128,15 +132,17 @@ class Store:
         return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper, self.outputs)
 
     def lawful(self, predictable: float) -> bool:
-        """Whether so many nats per sample may be left in what a law of noise could not predict: no more than another
-        name would cost."""
+        """Return True if the prediction errors of a noise effect are white enough.
+
+        Their predictable part, in nats per sample, must cost no more than another name.
+        """
         return self.counted * predictable < self.constants.per_name
 
     def score(self, s: Scored) -> float:
         return s.score(self.constants, self.counted) if s.proper else -np.inf
 
     def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
-        """Proper sets, the best of each set of names, best first."""
+        """Return the proper sets, the best of each set of names, best first."""
         best: dict[frozenset[str], Scored] = {}
         for s in self.sets.values() if sets is None else sets:
             if s.proper and (s.names not in best or self.score(s) > self.score(best[s.names])):
@@ -144,8 +150,10 @@ class Store:
         return sorted(best.values(), key=lambda s: (-self.score(s), sorted(s.names)))
 
     def room(self, s: Scored) -> dict[str, float]:
-        """Nats per output by which a larger set can be better at most: up to noise at its floor, and where a set has
-        found readings on a lattice, up to all of them exactly there."""
+        """Return the most nats per output by which a larger set can be better.
+
+        The bound is noise at its floor or, if a set has found readings on a lattice, the prediction of all of them.
+        """
         n = self.counted / self.outputs
         best = {
             o: b if d < b else max(b, self._exact[o])
@@ -154,7 +162,7 @@ class Store:
         return {o: max(n * (best[o] - d), 0.0) for o, d in s.density.items()}
 
     def without(self, s: Scored, drop: Callable[[Placed], bool]) -> Scored:
-        """The set less the effects that ``drop`` says, fitted again unless the store has it."""
+        """Return the set without the effects that ``drop`` selects, fitted again unless the store has it."""
         kept = [p for p in s.placed if not drop(p)]
         known = self.sets.get(key_of(kept))
         if known is not None:
@@ -164,7 +172,7 @@ class Store:
         return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
 
     def with_one(self, s: Scored, place: Placed) -> Scored:
-        """The set with one more effect, prepared from what the set leaves."""
+        """Return the set with one more effect, prepared from the residual of the set."""
         known = self.sets.get(s.key | {part_of(place)})
         if known is not None:
             return known
@@ -172,7 +180,7 @@ class Store:
             return self.put(added(self.problem, s.fitted, place))
 
     def joined(self, s: Scored, one: Scored) -> Scored:
-        """The set with the single effect of another beside it, begun where that one ended."""
+        """Return the set joined with the single effect of another set, started from that fit."""
         (place,) = one.placed
         known = self.sets.get(s.key | one.key)
         if known is not None:
@@ -180,22 +188,22 @@ class Store:
         model = Model(self.problem.twin, (*s.placed, place))
         theta = model.carry(s.fitted.model, s.fitted.theta, self.problem.recording)
         own = zip(model.slices(len(s.placed)), one.fitted.model.slices(0), strict=True)
-        for here, there in own:
-            theta[here] = one.fitted.theta[there]
+        for target, source in own:
+            theta[target] = one.fitted.theta[source]
         with np.errstate(all="ignore"):
             return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
 
     def refined(self, s: Scored) -> Scored:
-        """The set fitted on every row until nothing moves."""
+        """Return the set fitted on every row until convergence."""
         with np.errstate(all="ignore"):
             return self.put(fit(self.problem, s.fitted.model, [s.fitted.theta], iterations=15))
 
     def with_events(self, s: Scored) -> Scored:
-        """The set with those events (bursts) beside it that their own tests find in what it leaves, clearly on one
-        output of all that were tested and at all on the others; ``eventful`` keeps it with the p-value per name.
+        """Return the set with the events (bursts) that their own tests find in its residual.
 
-        Few samples are no reason to doubt the form of a course, and a tempered score would temper them: events have
-        no price, and a part in the density of whatever set they stand beside.
+        The test must be clear on one of the tested outputs and positive on the others; ``eventful`` keeps the result
+        with the p-value per name. Tempering suits errors of form and not the few samples of events, so events have no
+        price and are part of the density of any set beside which they stand.
         """
         if s.key not in self.eventful:
             with np.errstate(all="ignore"):
@@ -222,8 +230,10 @@ class Store:
         return self.scored(fit(p, model, [theta], iterations=15)), clear
 
     def pays(self, s: Scored, name: str, found: Sequence[Candidate]) -> bool:
-        """Whether what events ``name`` explain beyond heavy tails of the noise is worth a name: over all samples, since
-        no course is extrapolated."""
+        """Return True if the events ``name`` explain enough beyond heavy tails of the noise to pay for a name.
+
+        All samples count, since no course is extrapolated.
+        """
         p = self.problem
         rows = np.union1d(p.fit_rows, p.held_rows)
         gain = 0.0
@@ -231,25 +241,25 @@ class Store:
             if c.placed.effect.name == name and c.p_value < LEAST_P and c.placed.effect.claims is not None:
                 o = c.placed.outputs[0]
                 r = unpredicted(p, s.fitted).residual[o][rows]
-                taken = c.placed.effect.claims(c.placed.settings, p.recording.n)[p.index][rows]
+                claimed = c.placed.effect.claims(c.placed.settings, p.recording.n)[p.index][rows]
                 span, r = float(np.ptp(p.measured[o])), r - np.median(r)
                 # a reading beside an edge of its lattice falls on either side
-                taken &= np.abs(r) > EDGE * p.floors[o].step
-                gain += gain_of_events(r, taken, span, LEAST * p.floors[o].rms)
+                claimed &= np.abs(r) > EDGE * p.floors[o].step
+                gain += gain_of_events(r, claimed, span, LEAST * p.floors[o].rms)
         return gain > self.constants.per_name
 
     def z_of(self, s: Scored, name: str) -> float:
-        """Whitened held-out correlation of what ``name`` does with what the set without it leaves.
+        """Return the whitened held-out correlation of the contribution of ``name`` with the residual without it.
 
-        An effect of events or of noise has no course that could be predicted: its own test stands in for it.
+        An effect of events or of noise has no predictable course: its own test replaces the correlation.
         """
         if (s.key, name) not in self._tests:
-            mine = [p for p in s.placed if p.effect.name == name]
-            if all(e.effect.stochastic for e in mine):
+            placed = [p for p in s.placed if p.effect.name == name]
+            if all(e.effect.stochastic for e in placed):
                 rest = self.without(s, lambda e: e.effect.name == name).fitted
                 with np.errstate(all="ignore"):
                     ground = bend(self.problem, rest)
-                    found = [one_step(self.problem, rest, e, ground) for e in mine]
+                    found = [one_step(self.problem, rest, e, ground) for e in placed]
                 z = max((z_of_p(c.p_value * len(self.seen)) for c in found if c.tested), default=0.0)
             else:
                 small = self.without(s, lambda p: p.effect.name == name)
@@ -258,19 +268,20 @@ class Store:
         return self._tests[s.key, name]
 
     def least_z(self, s: Scored) -> float:
-        """The weakest of the names of a set; infinite for the empty set."""
+        """Return the weakest test of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
 
 
 def recordings_held(problem: Problem) -> int:
-    """How many recordings have samples that are held out; 1 where there is one recording."""
+    """Return the number of recordings with held-out samples; 1 for a single recording."""
     held = problem.split.held_out
     return max(sum(any(a < p.stop and p.start < b for a, b in held) for p in problem.recording.parts), 1)
 
 
 def outputs_at_odds(room: Sequence[float]) -> float:
-    """How many outputs have something to explain, from what each leaves above its noise: all of them where each leaves
-    as much, one where one leaves it all (the inverse participation ratio).
+    """Return the effective number of outputs with something to explain, from the room of each above its noise.
+
+    It is the inverse participation ratio: all of them if the rooms are equal, one if a single output has it all.
     """
     left = np.asarray(room)
     squares = float(left @ left)
@@ -278,24 +289,24 @@ def outputs_at_odds(room: Sequence[float]) -> float:
 
 
 EDGE = 1.001
-"""Steps of the lattice of readings up to which a residual is no event; above one by its rounding."""
+"""Residual, in steps of the lattice of readings, up to which a sample is no event; above one because of rounding."""
 EVENTS = 2
-"""Numbers that a law of noise has: how much of it there is, and of what size. What it did at which sample is not a
-number of the law: the density has paid for that, sample by sample."""
+"""Number of parameters of an effect that is noise or events: its rate and its size. Its course is not a parameter,
+because the density pays for it sample by sample."""
 
 
 def figures_of(placed: Placed) -> int:
-    """How many numbers an effect brings."""
+    """Return the number of parameters that an effect brings."""
     noise = placed.effect.predict is not None or placed.effect.claims is not None
     return EVENTS if noise else size(placed)
 
 
 def improper(fitted: Fit, placed: Placed) -> bool:
-    """Whether a figure of a fitted effect is beyond its physics, or one without which it says nothing at its bound."""
+    """Return True if a figure of a fitted effect is outside its physical range, or an essential one is at its bound."""
     stuck = any(f"{placed.label}.{n}" in fitted.at_bound for n in placed.effect.essential)
     return stuck or beyond_limits(fitted, placed)
 
 
 def z_of_p(p: float) -> float:
-    """Normal quantile of a p-value that was corrected for how many candidates were screened (Bonferroni)."""
+    """Return the normal quantile of a p-value that was corrected for the number of screened candidates (Bonferroni)."""
     return float(norm.isf(min(max(p, 1e-300), 1.0 - 1e-9)))

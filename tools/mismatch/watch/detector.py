@@ -1,4 +1,4 @@
-"""The sequential test: an e-detector per channel, causal, block by block.
+"""Implements the sequential test: an e-detector per channel, causal, block by block.
 
 Principle: Shin, Ramdas and Rinaldo, E-detectors, New England Journal of Statistics in Data Science 2(2), 2024. Where
 the factor ``e`` of a block has expectation at most 1 given the past, ``M <- (1 + M) e`` (the recursion of Shiryaev and
@@ -27,9 +27,11 @@ NAMES_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Alarm:
-    """A channel left its twin. ``t_s``: end of the block that raised the alarm; ``onset_s``: estimated begin of the
-    change; both since the first sample. ``figure``: level or power of the whitened residual; ``rises``: its direction;
-    ``size``: its mean since the onset, in deviations of a block.
+    """Reports that a channel departed from its twin.
+
+    ``t_s``: end of the block that raised the alarm; ``onset_s``: estimated onset of the change; both since the first
+    sample. ``figure``: level or power of the whitened residual; ``rises``: its direction; ``size``: its mean since the
+    onset, in deviations of a block.
     """
 
     channel: str
@@ -42,8 +44,10 @@ class Alarm:
 
 @dataclass(frozen=True)
 class State:
-    """All that the test remembers: the last samples (n, channels), the number of samples and blocks seen, and per
-    channel and member the logarithm of M, the CUSUM of its log factors and the block at which that was last zero.
+    """Holds the state of the test.
+
+    It consists of the last samples (n, channels), the number of samples and blocks seen, and per channel and member the
+    logarithm of M, the CUSUM of its log factors and the block at which that was last zero.
     """
 
     recent: Array
@@ -57,7 +61,7 @@ class State:
 
 
 def begin(reference: Reference) -> State:
-    """The state before the first sample."""
+    """Return the state before the first sample."""
     shape = (len(reference.channels), MEMBERS)
     return State(
         np.zeros((0, shape[0])), 0, 0, np.full(shape, -np.inf), np.zeros(shape), np.zeros(shape, np.int64),
@@ -66,12 +70,12 @@ def begin(reference: Reference) -> State:
 
 
 def interrupt(state: State) -> State:
-    """The state where a new run begins: what whitening remembers is dropped, the evidence is kept."""
+    """Return the state at the start of a new run: the memory of the whitening is dropped, the evidence is kept."""
     return replace(state, recent=state.recent[:0])
 
 
 def follow(reference: Reference, state: State, residual: Array) -> tuple[State, list[Alarm]]:
-    """Take further residuals (n, channels), any number of samples. A channel that alarms begins anew."""
+    """Process further residuals (n, channels), any number of samples. A channel restarts after its alarm."""
     data = np.concatenate([state.recent, residual])
     samples = state.samples + residual.shape[0]
     figures = reference.figures(data)

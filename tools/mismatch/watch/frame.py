@@ -1,8 +1,8 @@
-"""A twin beside a running instrument: it takes rows of the frame as they come and returns its residual on them.
+"""Runs a twin beside an instrument: it takes rows of the frame as they come and returns its residual on them.
 
-A twin of a whole bench with a hand of its own runs on without an end. Every other twin runs freely over the newest
-rows and ``LEAD_S`` before them, afresh each time: its states forget their start, and what is left of the start is part
-of the reference residual as well.
+A twin of a whole bench with its own hand runs on without an end. Every other twin runs freely over the newest rows and
+``LEAD_S`` before them, anew each time: the influence of its start state decays, and the rest of it is part of the
+reference residual as well.
 """
 
 from __future__ import annotations
@@ -31,21 +31,27 @@ from tools.mismatch.twins.instrument import GivenHand, bench_world
 from tools.mismatch.twins.opaque import OpaqueTwin
 
 LEAD_S = 4.0
-"""Time before the newest rows over which a twin with states runs to forget where it began."""
+"""Time before the newest rows over which a twin with states runs until its start state has decayed."""
 HOP_S = 1.0
 """Time of new rows that are simulated at once."""
 PLACEHOLDERS = 64
+<<<<<<< HEAD
 """Samples of the made-up columns by which the twin is checked before anything runs."""
 STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("012345"))]}
 """Channels of a twin file that names none: quantity of the frame, unit, role, parts. Supply and temperature (6 and 7)
 are the room's, whose wander no twin knows."""
 SUPPLY = 6
 """Input of the DAQ with a part of the accelerometers' supply, to which their readings are proportional."""
+=======
+"""Number of samples of the synthetic columns by which the twin is checked before anything runs."""
+STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("01234567"))]}
+"""Default channels of a twin file: quantity of the frame, unit, role, parts."""
+>>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
 
 
 @dataclass(frozen=True)
 class World:
-    """What moves the emulated instrument of a run beside its bench file: what the twin has to know of it."""
+    """Describes the motion of an emulated instrument that its bench file does not define and the twin needs."""
 
     seed: int | None = None
     hand_file: str | None = None
@@ -53,7 +59,7 @@ class World:
 
 
 class LiveTwin:
-    """The residual of a twin on rows of the frame. ``outputs`` are its channels, ``unit`` their units."""
+    """Computes the residual of a twin on rows of the frame. ``outputs`` are its channels, ``unit`` their units."""
 
     def __init__(self, template: Recording, columns: Mapping[str, int], course: BenchCourse | None) -> None:
         """Use ``open_twin``."""
@@ -70,16 +76,16 @@ class LiveTwin:
 
     @property
     def needs_bench_time(self) -> bool:
-        """True where the twin has to know how long the emulated world had run when the run began (``begin_at``)."""
+        """Return True if the twin needs the time that the emulated world had run before the run (``begin_at``)."""
         return self._course is not None
 
     @property
     def start_s(self) -> float:
-        """How long the emulated world had run when the run began."""
+        """Return the time in s that the emulated world had run when the run began."""
         return self._course.start_s if self._course is not None else 0.0
 
     def begin_at(self, start_s: float) -> None:
-        """The world had run for ``start_s`` when the run began."""
+        """Set the time that the world had run when the run began to ``start_s``."""
         if self._course is not None:
             self._course.start_s = start_s
 
@@ -88,8 +94,9 @@ class LiveTwin:
         self._rows, self._base, self._done = np.zeros((0, 0)), self._base[:0], 0
 
     def advance(self, t_s: Array, rows: Array) -> Array:
-        """Take ``rows`` (n, columns of the frame) at ``t_s`` (n,). Return the residual (k, outputs) of the rows that
-        are now due, in the order of the rows: measured less simulated.
+        """Take ``rows`` (n, columns of the frame) at ``t_s`` (n,) and return residuals (k, outputs) of the due rows.
+
+        Residuals are measured less simulated, in the order of the rows.
         """
         if self._course is not None:
             base = self._course.advance(t_s, rows)
@@ -107,7 +114,7 @@ class LiveTwin:
         return left
 
     def _run(self) -> Array:
-        """The residual (n, outputs) of one free run over all rows that are kept."""
+        """Return the residual (n, outputs) of one free run over all rows that are kept."""
         n = self._rows.shape[0]
         course = replace(
             self.template,
@@ -130,24 +137,33 @@ class LiveTwin:
 
 
 class BenchCourse:
-    """The noiseless emulated bench of an ``instrument`` twin, which runs on from call to call.
+    """Runs the noiseless emulated bench of an ``instrument`` twin on from call to call.
 
+<<<<<<< HEAD
     Accelerometers get the measured supply in the place of the twin's. Commands are left out: they move the tip, which
     no channel of the frame measures.
+=======
+    It omits commands: they move the tip, which no channel of the frame measures.
+>>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
     """
 
     def __init__(self, config: EmulationConfig, own_hand: bool, world: World, unit: Mapping[str, str]) -> None:
         seed = config.seed if world.seed is None else world.seed
         at_rest = GivenHand(holding_frame(config.hand), np.array([0.0, 1.0]), np.zeros((2, 6)))
         hand = make_hand(config.hand, seed, world.hand_file, world.hand_scale) if own_hand else at_rest
-        # the truth of the tip is not asked for: little of it is kept
+        # the truth of the tip is not used, so little of it is kept
         config = config.model_copy(update={"truth_s": 1.0})
         self._instrument = Instrument(config, seed, hand, unit=config.unit, quiet=True)
         self._unit = {o: (int(o.rpartition("_")[2]), u) for o, u in unit.items() if o.startswith("volts_")}
         self.start_s = 0.0
 
+<<<<<<< HEAD
     def advance(self, t_s: Array, rows: Array) -> dict[str, Array]:
         """Outputs (n,) at ``t_s`` (n,), each not before the last one, beside ``rows`` of the frame."""
+=======
+    def advance(self, t_s: Array) -> dict[str, Array]:
+        """Return outputs (n,) at ``t_s`` (n,), which does not decrease."""
+>>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
         volts = np.empty((t_s.size, 8))
         for k, t_ns in enumerate(np.round((t_s + self.start_s) * 1e9).astype(np.int64).tolist()):
             self._instrument.advance_to(t_ns)
@@ -157,8 +173,10 @@ class BenchCourse:
 
 
 def open_twin(path: Path, bench: BenchFile, names: Sequence[str], world: World) -> LiveTwin:
-    """The twin of a file that ``micron mismatch apply`` wrote, or of a ``recording.toml`` whose channels are columns of
-    the frame (``names``), beside a run of ``bench``. InputError or RecordingError says what is wrong with it.
+    """Open a twin beside a run of ``bench``.
+
+    ``path`` is a file that ``micron mismatch apply`` wrote, or a ``recording.toml`` whose channels are columns of the
+    frame (``names``). Raises InputError or RecordingError for any fault.
     """
     file = path / "recording.toml" if path.is_dir() else path
     if file.suffix.lower() != ".toml":

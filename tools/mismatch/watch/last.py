@@ -1,4 +1,4 @@
-"""The newest rows of a watched run as a recording that the engine can diagnose beside the same twin."""
+"""Writes the newest rows of a watched run as a recording that the engine can diagnose with the same twin."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ LEAST_S = 5.0
 
 
 def write_recording(folder: Path, source: Path, twin: LiveTwin, t_s: Array, columns: Mapping[str, Array]) -> None:
-    """Write ``recording.toml`` and its data to ``folder``: what of ``t_s`` (n,) is behind its last gap.
-    ``source``: the twin's file; ``columns`` (n,): by name, in the units of the frame.
+    """Write ``recording.toml`` and its data to ``folder``: the part of ``t_s`` (n,) behind its last gap.
 
-    InputError where less than ``LEAST_S`` are left.
+    ``source``: the twin's file; ``columns`` (n,): by name, in the units of the frame. Raises InputError if less than
+    ``LEAST_S`` remain.
     """
     gaps = np.flatnonzero(np.diff(t_s) > GAP * twin.dt)
     first = int(gaps[-1]) + 1 if gaps.size else 0

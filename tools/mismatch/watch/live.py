@@ -1,7 +1,7 @@
 """Watches a running instrument in a thread of its own: rows of the frame in, residual and alarms out.
 
-The first part of the run is the reference in which the twin is good; behind it the sequential test looks at every
-block. The tick knows nothing of it: rows come from the memory that any number of processes may read.
+The first part of the run is the reference in which the twin is good; after it the sequential test examines every
+block. The tick is independent of it: rows come from shared memory that any number of processes may read.
 """
 
 from __future__ import annotations
@@ -23,11 +23,16 @@ from tools.mismatch.watch.detector import Alarm, State, begin, follow, interrupt
 from tools.mismatch.watch.frame import LiveTwin
 from tools.mismatch.watch.reference import Reference, learn
 
+<<<<<<< HEAD
+=======
+REFERENCE_S = 60.0
+"""Default length of the first part of a run in which the twin is good."""
+>>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
 SHOWN_S = 1.0
-"""Time over which the rms that is shown is taken."""
+"""Time over which the displayed rms is computed."""
 MOST_ALARMS = 200
 MOST_WAITING = 50
-"""Pieces of rows that may wait for the thread; in real time later ones are dropped, which counts as a gap."""
+"""Largest number of pieces of rows that wait for the thread; in real time later ones are dropped, which is a gap."""
 GAP = 1.5
 """Time between two rows, in time steps, from which rows are missing between them."""
 
@@ -43,9 +48,11 @@ class Settings:
 
 @dataclass(frozen=True)
 class Watching:
-    """The state of a watch, as the page shows it. ``phase``: reference, watching or failed (``why``); ``rms`` and
-    ``reference_rms`` by channel, in ``unit``; ``alarms``: the first ``MOST_ALARMS``, with times since the start of the
-    run; ``cpu_share``: processor time of the thread over the time of the run; ``gaps``: places where rows were missing.
+    """Holds the state of a watch for the page.
+
+    ``phase``: reference, watching or failed (``why``); ``rms`` and ``reference_rms`` by channel, in ``unit``;
+    ``alarms``: the first ``MOST_ALARMS``, with times since the start of the run; ``cpu_share``: processor time of the
+    thread over the time of the run; ``gaps``: number of places where rows were missing.
     """
 
     twin: str
@@ -64,13 +71,14 @@ class Watching:
     cpu_share: float
 
     def to_json(self) -> dict[str, Any]:
-        """JSON values for the page and for ``micron run --json``."""
+        """Return JSON values for the page and for ``micron run --json``."""
         return {"verdict": "leaves" if self.alarms else "stays", **asdict(self)}
 
 
 class LiveWatch:
-    """Watch with ``push``; read with ``state``; ``close`` ends the thread. ``is_patient``: ``push`` waits for the
-    thread, where no time of the bench passes meanwhile.
+    """Watches a run: ``push`` takes rows, ``state`` returns the state, ``close`` ends the thread.
+
+    With ``is_patient``, ``push`` waits for the thread; no time of the bench passes meanwhile.
     """
 
     def __init__(self, twin: LiveTwin, settings: Settings, *, is_patient: bool) -> None:
@@ -94,13 +102,13 @@ class LiveWatch:
         self._thread.start()
 
     def begin_at(self, start_s: float) -> None:
-        """The bench's clock stood at ``start_s`` when the run began: before the first ``push``."""
+        """Set the time of the bench's clock at the start of the run, before the first ``push``."""
         self._twin.begin_at(start_s)
         self._has_begun = True
 
     @property
     def has_begun(self) -> bool:
-        """True once the watch knows all that it has to know before rows come."""
+        """Return True once the watch has everything that it needs before rows come."""
         return self._has_begun
 
     def push(self, rows: Array) -> None:
@@ -113,10 +121,10 @@ class LiveWatch:
         try:
             self._queue.put_nowait(rows)
         except queue.Full:
-            return  # the next rows are behind a gap
+            return  # the next rows follow a gap
 
     def state(self) -> Watching:
-        """The state as of the rows that were looked at."""
+        """Return the state after the rows processed so far."""
         with self._lock:
             names, reference = self._twin.outputs, self._reference
             rms = np.sqrt(np.nanmean(self._recent**2, axis=0)) if len(self._recent) else np.full(len(names), np.nan)
@@ -141,7 +149,7 @@ class LiveWatch:
             )
 
     def close(self) -> Watching:
-        """Look at what was pushed, end the thread and return the last state."""
+        """Process all pushed rows, end the thread and return the last state."""
         if self._thread.is_alive():
             self._queue.put(None)
             self._thread.join()
@@ -183,7 +191,7 @@ class LiveWatch:
 
     def _piece(self, t_s: Array, rows: Array) -> None:
         away = self._twin.advance(t_s, rows)
-        # a scan that was repeated says nothing about now
+        # a repeated scan has no new information
         stale = (rows[:, STATUS].astype(np.int64) & int(FrameStatus.STALE)) != 0
         if stale.any() and len(away) == len(rows):
             away[stale] = np.nan
@@ -205,7 +213,7 @@ class LiveWatch:
             return
         table = np.concatenate(self._gathered)
         good = np.asarray(np.isfinite(table).all(axis=1), np.bool_)
-        # a lost sample of a reference costs the row, and the whitener begins afresh behind it
+        # a lost sample of a reference costs the row, and the whitener restarts behind it
         cuts = {int(np.count_nonzero(good[:i])) for i in (*self._restarts, *np.flatnonzero(~good).tolist())}
         table = table[good]
         restarts = tuple(sorted(c for c in cuts if 0 < c < len(table)))
@@ -215,13 +223,13 @@ class LiveWatch:
         with self._lock:
             self._reference, self._order = reference, order
         self._gathered = []
-        # the test begins at the next row, with nothing remembered
+        # the test begins at the next row, without memory
         self._state = begin(reference)
 
     def _test(self, away: Array) -> None:
         assert self._reference is not None
         assert self._state is not None
-        # the test counts the samples that it saw, which gaps and leads do not belong to
+        # the test counts its own samples, without gaps and leads
         shift_s = self._last_s - (len(away) - 1 + self._state.samples) * self._twin.dt
         self._state, found = follow(self._reference, self._state, away[:, self._order])
         with self._lock:
@@ -233,7 +241,7 @@ class LiveWatch:
 
 
 def lines(watching: Watching) -> list[str]:
-    """What ``micron run`` says about the watch, a sentence per line."""
+    """Return the lines that ``micron run`` prints about the watch, a sentence per line."""
     w = watching
     if w.phase == "failed":
         return [f"watch: nothing is watched: {w.why}"]

@@ -1,4 +1,4 @@
-"""A twin beside a finished recording: when and where the recorded channels leave it."""
+"""Tests a finished recording against a twin: when and where the recorded channels depart from it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ from tools.mismatch.watch.reference import Array, Reference, learn
 LONGEST_REFERENCE_S = 300.0
 REFERENCE_SHARE = 1 / 3
 PER_HOUR = 0.01
-"""False alarms per hour of all channels together that a watch is set to unless told otherwise."""
+"""Default rate of false alarms of a watch, per hour, of all channels together."""
 
 
 @dataclass(frozen=True)
 class Departure:
-    """A channel that left its twin: time of the first and last alarm and of the onset (s of the recording), what of the
-    whitened residual changed, and the rms of the residual in the reference and since the onset, in ``unit``.
+    """Describes the departure of a channel from its twin.
+
+    It holds the times of the first and last alarm and of the onset (s of the recording), the figure of the whitened
+    residual that changed, and the rms of the residual in the reference and since the onset, in ``unit``.
     """
 
     channel: str
@@ -44,7 +46,7 @@ class Departure:
 
 @dataclass(frozen=True)
 class Watched:
-    """What a watch over a whole recording found: ``departures`` by onset, ``left_out`` with the reason."""
+    """Holds the result of a watch over a recording: ``departures`` by onset, ``left_out`` channels with the reason."""
 
     twin: str
     recording: str
@@ -57,15 +59,17 @@ class Watched:
     departures: tuple[Departure, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON of the command."""
+        """Return the JSON of the command."""
         return {"format": 1, "verdict": "leaves" if self.departures else "stays", **asdict(self)}
 
 
 def watch_recording(
     twin: Path, recording: Path, reference_s: float | None = None, false_alarms_per_hour: float = PER_HOUR
 ) -> Watched:
-    """Run ``twin`` freely beside ``recording`` and test its residual behind the first ``reference_s`` seconds (a third
-    of it, at most 300 s, if None). InputError or RecordingError says what is wrong with twin, recording or reference.
+    """Run ``twin`` freely beside ``recording`` and test its residual after the first ``reference_s`` seconds.
+
+    The default reference is a third of the recording, at most 300 s. Raises InputError or RecordingError for a fault of
+    twin, recording or reference.
     """
     loaded = load(recording)
     found = simulate_file(twin, recording)
@@ -103,7 +107,7 @@ def _reference_end(recording: Recording, reference_s: float | None) -> int:
 
 
 def _follow_all(reference: Reference, table: Array, stop: int, segments: tuple[int, ...]) -> list[Alarm]:
-    """Alarms behind sample ``stop``; whitening starts from the end of the reference and afresh in each segment."""
+    """Return alarms after sample ``stop``; whitening starts at the reference's end and restarts in each segment."""
     first = max(0, stop - reference.warm_up)
     inside = [s for s in segments if s > first]
     state: State = begin(reference)
@@ -145,7 +149,7 @@ def _departures(
 
 
 def lines(watched: Watched) -> list[str]:
-    """What the command prints, a sentence per line."""
+    """Return the lines that the command prints, a sentence per line."""
     (a, b), (c, d) = watched.reference_s, watched.watched_s
     out = [
         f"Reference: {a:.4g} to {b:.4g} s. Watched: {c:.4g} to {d:.4g} s in blocks of {watched.block_s:.3g} s, at most "
@@ -166,7 +170,7 @@ def lines(watched: Watched) -> list[str]:
 
 
 def sentence(departure: Departure) -> str:
-    """One departure in words."""
+    """Return a departure in words."""
     d, verb = departure, "rises" if departure.rises else "falls"
     return (
         f"{d.channel}: leaves the twin at about {d.onset_s:.2f} s (alarm {d.alarm_s:.2f} s, last {d.last_s:.2f} s): "

@@ -1,9 +1,9 @@
-"""What the test takes from a reference part of the residual: a whitening filter and allowances for what is unknown.
+"""Calibrates the test on a reference part of the residual: a whitening filter and confidence bounds.
 
 A residual of a good twin is coloured, heavy-tailed and known from a finite part only. The long autoregression of
 ``engine.colour`` whitens it; two figures are kept of each block of innovations: ``level`` (their sum) and ``power``
 (the logarithm of their mean square), centred and scaled on the reference and clipped at ``CLIP`` deviations, so that
-one block decides nothing. For each figure, side and tilt the reference gives an upper bound of the cumulant function
+no single block decides. For each figure, side and tilt the reference gives an upper bound of the cumulant function
 ``log E exp(tilt * figure)``: the empirical one of a block or the Gaussian one with the long-run variance over blocks,
 whichever is larger, each at the end of a one-sided confidence interval. With ``exp(tilt * figure - bound)`` as the
 factor of a block, the expectation of a factor is at most 1: for independent blocks up to the confidence of the bound,
@@ -38,18 +38,20 @@ CONFIDENCE = 0.99
 MEMORY_LAGS = 4
 """Order of the autoregression over blocks that gives the long-run variance."""
 LEAST_PIECES = 10
-"""Independent values of the level in a reference below which the level is not watched: its mean is not known."""
+"""Least number of independent values of the level in a reference; with fewer its mean is unknown and not watched."""
 LEAST_LEFT = 0.02
-"""Least of one minus the sum of the coefficients of that autoregression: more memory is not told from a drift."""
+"""Least value of one minus the sum of the autoregression's coefficients; a longer memory looks like a drift."""
 BATCHES = 20
-"""Number of batches whose means give the long-run variance a second time."""
+"""Number of batches whose means give a second estimate of the long-run variance."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel of the reference: ``rms`` of its residual, ``wander_s``: the time that gives one independent value of
-    its level; ``centre``, ``scale`` (2,) of the figures of a block; ``bounds`` (2, 2, tilts) of the cumulant function,
-    by figure, side (up, down) and tilt, infinite where the figure is not watched.
+    """Holds a channel of the reference.
+
+    ``rms`` of its residual; ``wander_s``: the time that gives one independent value of its level; ``centre``, ``scale``
+    (2,) of the figures of a block; ``bounds`` (2, 2, tilts) of the cumulant function, by figure, side (up, down) and
+    tilt, infinite where the figure is not watched.
     """
 
     name: str
@@ -64,8 +66,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Reference:
-    """The test's view of a good twin: ``channels``, the time step (s), samples of a ``block``, false alarms per hour of
-    all channels together, and what is not watched (``left_out``): a channel or its level, with the reason.
+    """Holds the calibration of the test on a good twin.
+
+    It has the ``channels``, the time step (s), samples of a ``block``, false alarms per hour of all channels together,
+    and the channels or levels that are not watched (``left_out``), with the reason.
     """
 
     channels: tuple[Channel, ...]
@@ -76,17 +80,18 @@ class Reference:
 
     @property
     def warm_up(self) -> int:
-        """Samples before a block that whitening needs."""
+        """Return the number of samples before a block that whitening needs."""
         return max(c.whitener.warm_up for c in self.channels)
 
     @property
     def run_length(self) -> float:
-        """Average run length (blocks) that each channel must have: its Bonferroni share of the rate."""
+        """Return the required average run length (blocks) of each channel: its Bonferroni share of the rate."""
         return len(self.channels) * 3600.0 / (self.false_alarms_per_hour * self.block * self.dt)
 
     def figures(self, residual: Array) -> Array:
-        """Figures of all whole blocks of ``residual`` (n, channels) behind the warm-up: (blocks, channels, 2), in
-        deviations; NaN where a sample of the block or of its warm-up is not finite.
+        """Return the figures (blocks, channels, 2) of all whole blocks of ``residual`` (n, channels), in deviations.
+
+        Blocks start after the warm-up. A figure is NaN where a sample of the block or of its warm-up is not finite.
         """
         warm, block = self.warm_up, self.block
         count = max(0, (residual.shape[0] - warm) // block)
@@ -105,7 +110,7 @@ class Reference:
 
 
 def block_figures(innovations: Array) -> Array:
-    """``level`` and ``power`` (blocks, 2) of innovations (blocks, samples)."""
+    """Return ``level`` and ``power`` (blocks, 2) of innovations (blocks, samples)."""
     n = innovations.shape[1]
     power = np.mean(innovations * innovations, axis=1)
     return np.stack([innovations.sum(axis=1) / math.sqrt(n), np.log(power + np.finfo(np.float64).tiny)], axis=1)
@@ -114,8 +119,10 @@ def block_figures(innovations: Array) -> Array:
 def learn(
     residuals: Mapping[str, Array], dt: float, false_alarms_per_hour: float, restarts: tuple[int, ...] = ()
 ) -> Reference:
-    """The reference from residuals (n,) of a part in which the twin is good; ``restarts``: samples at which a new run
-    begins. InputError when the part is too short or no channel can be watched.
+    """Learn the reference from residuals (n,) of a part in which the twin is good.
+
+    ``restarts``: samples at which a new run begins. Raises InputError if the part is too short or no channel can be
+    watched.
     """
     block = max(LEAST_BLOCK, round(BLOCK_S / dt))
     n = next(iter(residuals.values())).size
@@ -135,8 +142,8 @@ def learn(
                 f"it wanders within about {c.wander_s:.2g} s; a reference of {LEAST_PIECES * c.wander_s:.0f} s shows it"
             )
     if not channels:
-        said = "; ".join(f"{name}: {why}" for name, why in left_out.items())
-        raise InputError(f"no channel can be watched ({said}); take another reference part")
+        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
+        raise InputError(f"no channel can be watched ({reasons}); take another reference part")
     return Reference(tuple(channels), dt, block, false_alarms_per_hour, left_out)
 
 
@@ -166,13 +173,13 @@ def _channel(name: str, residual: Array, stretches: list[tuple[int, int]], block
 
 
 def correlation_blocks(means: Array) -> float:
-    """Number of blocks that count as one independent one in the mean of ``means`` (blocks,), at least 1."""
+    """Return the number of blocks equivalent to an independent one in the mean of ``means`` (blocks,), at least 1."""
     variance, phi, innovation, _ = _autoregression(means - means.mean())
     return max(1.0, innovation / max(1.0 - float(phi.sum()), LEAST_LEFT) ** 2 / variance) if variance else 1.0
 
 
 def _bound(x: Array) -> Array:
-    """Upper confidence bounds (tilts,) of the cumulant function of the figures ``x`` (blocks,)."""
+    """Return upper confidence bounds (tilts,) of the cumulant function of the figures ``x`` (blocks,)."""
     n = x.size
     memory = long_run_variance(x)
     quantile = float(stats.t.ppf(CONFIDENCE, n - 1))
@@ -185,8 +192,9 @@ def _bound(x: Array) -> Array:
 
 
 def long_run_variance(x: Array) -> float:
-    """Upper confidence bound of the variance of a sum of ``x`` (n,) per term: the spectral density at zero of an
-    autoregression (Yule-Walker), and the variance of batch means where that is larger.
+    """Return an upper confidence bound of the variance of a sum of ``x`` (n,) per term.
+
+    It is the spectral density at zero of an autoregression (Yule-Walker), or the variance of batch means if larger.
     """
     n = x.size
     variance, phi, innovation, error = _autoregression(x - x.mean())
@@ -201,8 +209,9 @@ def long_run_variance(x: Array) -> float:
 
 
 def _autoregression(c: Array) -> tuple[float, Array, float, float]:
-    """Variance of ``c`` (n,), which has mean 0, its coefficients, innovation variance and the standard error of the sum
-    of the coefficients.
+    """Fit an autoregression to ``c`` (n,) of mean 0.
+
+    Returns the variance, the coefficients, the innovation variance and the standard error of the coefficients' sum.
     """
     n = c.size
     gamma = np.array([float(c[: n - k] @ c[k:]) / n for k in range(MEMORY_LAGS + 1)])
