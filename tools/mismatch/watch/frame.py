@@ -35,18 +35,12 @@ LEAD_S = 4.0
 HOP_S = 1.0
 """Time of new rows that are simulated at once."""
 PLACEHOLDERS = 64
-<<<<<<< HEAD
-"""Samples of the made-up columns by which the twin is checked before anything runs."""
-STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("012345"))]}
-"""Channels of a twin file that names none: quantity of the frame, unit, role, parts. Supply and temperature (6 and 7)
-are the room's, whose wander no twin knows."""
-SUPPLY = 6
-"""Input of the DAQ with a part of the accelerometers' supply, to which their readings are proportional."""
-=======
 """Number of samples of the synthetic columns by which the twin is checked before anything runs."""
-STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("01234567"))]}
-"""Default channels of a twin file: quantity of the frame, unit, role, parts."""
->>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
+STANDARD = {"instrument": [("command", "V", "input", ("1", "2", "3")), ("volts", "V", "output", tuple("012345"))]}
+"""Default channels of a twin file: quantity of the frame, unit, role, parts. Supply and temperature (6 and 7) belong to
+the room, whose wander no twin models."""
+SUPPLY = 6
+"""DAQ input with a fraction of the accelerometers' supply, to which their readings are proportional."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +133,8 @@ class LiveTwin:
 class BenchCourse:
     """Runs the noiseless emulated bench of an ``instrument`` twin on from call to call.
 
-<<<<<<< HEAD
-    Accelerometers get the measured supply in the place of the twin's. Commands are left out: they move the tip, which
+    Accelerometers get the measured supply instead of the twin's. Commands are omitted: they move the tip, which
     no channel of the frame measures.
-=======
-    It omits commands: they move the tip, which no channel of the frame measures.
->>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
     """
 
     def __init__(self, config: EmulationConfig, own_hand: bool, world: World, unit: Mapping[str, str]) -> None:
@@ -157,13 +147,8 @@ class BenchCourse:
         self._unit = {o: (int(o.rpartition("_")[2]), u) for o, u in unit.items() if o.startswith("volts_")}
         self.start_s = 0.0
 
-<<<<<<< HEAD
     def advance(self, t_s: Array, rows: Array) -> dict[str, Array]:
-        """Outputs (n,) at ``t_s`` (n,), each not before the last one, beside ``rows`` of the frame."""
-=======
-    def advance(self, t_s: Array) -> dict[str, Array]:
-        """Return outputs (n,) at ``t_s`` (n,), which does not decrease."""
->>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
+        """Return outputs (n,) at ``t_s`` (n,), which does not decrease, beside ``rows`` of the frame."""
         volts = np.empty((t_s.size, 8))
         for k, t_ns in enumerate(np.round((t_s + self.start_s) * 1e9).astype(np.int64).tolist()):
             self._instrument.advance_to(t_ns)

@@ -23,11 +23,6 @@ from tools.mismatch.watch.detector import Alarm, State, begin, follow, interrupt
 from tools.mismatch.watch.frame import LiveTwin
 from tools.mismatch.watch.reference import Reference, learn
 
-<<<<<<< HEAD
-=======
-REFERENCE_S = 60.0
-"""Default length of the first part of a run in which the twin is good."""
->>>>>>> 711b85f (Docstrings and names of infer and watch follow the rules of words)
 SHOWN_S = 1.0
 """Time over which the displayed rms is computed."""
 MOST_ALARMS = 200
