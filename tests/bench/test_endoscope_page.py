@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_py.endoscope.frame import LAYOUT
 from firmware_py.recording.reader import Recording
 from tests.bench.conftest import READY, Server, bench_server, go, opened_tab
 from tools.bench.wire import HEADER
+from tools.cli.main import app
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -97,6 +100,16 @@ def test_bad_input_is_one_message(endoscope: Server, path: str, body: dict[str, 
     assert status == 400
     assert message in answer["error"]
     assert "\n" not in answer["error"]
+
+
+def test_a_hand_belongs_to_the_first_instrument(tmp_path: Path):
+    recordings = tmp_path / "recordings"
+    result = CliRunner().invoke(
+        app, ["bench", "--bench", "endoscope", "--hand", "x.npz", "--recordings", str(recordings)]
+    )
+    assert result.exit_code == 2
+    assert result.output.strip() == "micron: --hand belongs to the instrument; an endoscope bench has none"
+    assert not recordings.exists(), "nothing half written"
 
 
 def test_the_card_that_runs_plays_the_targeting_experiment(endoscope: Server):
