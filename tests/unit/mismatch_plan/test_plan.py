@@ -213,7 +213,7 @@ def test_before_any_recording_a_description_without_data_is_enough(tmp_path: Pat
     file = tmp_path / "recording.toml"
     file.write_text(DESCRIPTOR.format(data="", noise="noise_rms = 0.02"))
     found = prospect(file, Asked(Wish(amplitude=30.0, centre=50.0, duration_s=3.0)))
-    assert {"hysteresis", "creep"} <= {s.name for s in found.found.shown}
+    assert {"hysteresis", "creep"} <= {s.name for s in found.found.visible}
     assert found.channels["temperature"] == ("temperature_sensitivity",)
     assert "misalignment" in found.found.not_here
     assert found.isolable == (("input command", "output displacement"),)

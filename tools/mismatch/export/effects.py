@@ -1,4 +1,4 @@
-"""Each effect of the vocabulary as lines of numpy: what an exported twin sets up once, and what it adds to a signal."""
+"""Writes each effect of the vocabulary as lines of numpy: the setup of an exported twin, and the change of a signal."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ PER_FORCE = {
     "1/{out}": "{in} s^2/{out}^2",
     "1/({out}^2 s)": "{in} s/{out}^3",
 }
-"""Units of a force's weights per unit of mass, and as a force."""
+"""Maps units of a force's weights per unit of mass to units of force."""
 
 
 @dataclass
 class Writer:
-    """The lines of an exported twin while they are collected. ``parameters``: value and unit under each key;
-    ``setup``: what is done once, ``run``: what is done with samples; ``used``: functions of ``parts``.
+    """Collects the lines of an exported twin.
+
+    ``parameters`` has value and unit under each key; ``setup`` has the lines that run once, ``run`` those that process
+    samples; ``used`` lists functions of ``parts``.
     """
 
     dt: float
@@ -55,7 +57,7 @@ class Writer:
 
 @dataclass
 class Slot:
-    """One placed effect: ``at(name)`` is the code of a parameter, ``group(stem)`` that of a list of them."""
+    """Writes the code of a placed effect: ``at(name)`` is that of a parameter, ``group(stem)`` that of a list."""
 
     writer: Writer
     placed: Placed
@@ -86,25 +88,25 @@ class Slot:
         self.writer.parameters[f"{self.label}.{name}"] = (value, unit)
 
     def at(self, name: str) -> str:
-        """Code of one parameter."""
+        """Return the code of a parameter."""
         return self.place[name]
 
     def group(self, *stems: str) -> str:
-        """Code of the weights of several lists, one after the other."""
+        """Return the code of the weights of several lists, one after the other."""
         every = [f'p["{self.label}.{s}"]' for s in stems]
         return every[0] if len(every) == 1 else f"np.concatenate([{', '.join(every)}])"
 
     def setting(self, name: str) -> float:
-        """First number of a setting."""
+        """Return the first number of a setting."""
         return self.placed.settings[name][0]
 
     def part(self, name: str, arguments: str) -> str:
-        """See Writer: named after the effect."""
+        """See Writer; the local name contains that of the effect."""
         return self.writer.part(name, arguments, re.sub(r"\W", "_", self.label))
 
 
 def numbers(values: object) -> str:
-    """Code of numbers (any nesting), exact."""
+    """Return the exact code of numbers (any nesting)."""
     a = np.asarray(values, np.float64)
     if a.ndim == 0:
         return repr(float(a))
@@ -112,7 +114,7 @@ def numbers(values: object) -> str:
 
 
 Expression = Callable[[Slot, str, str], str]
-"""(slot, signal, driver) -> the changed signal, as code."""
+"""(slot, signal, driver) -> code of the changed signal."""
 
 
 def _lag(s: Slot, x: str, d: str) -> str:
@@ -179,7 +181,7 @@ def _quantization(s: Slot, x: str, d: str) -> str:
 
 
 def _elements(s: Slot, d: str) -> str:
-    """Code of the columns of a hysteresis, (n, elements)."""
+    """Return the code of the columns of a hysteresis, (n, elements)."""
     settings = s.placed.settings
     lo, hi = settings["range"]
     half, rest = 0.5 * (hi - lo), numbers(settings["rest"][0])
@@ -252,7 +254,7 @@ def _rate_hysteresis(s: Slot, x: str, d: str) -> str:
 
 def _creep(s: Slot, x: str, d: str) -> str:
     taus = numbers(s.placed.settings["time_constants_s"])
-    # every mode is a low-pass of its own that begins at rest
+    # every mode is a separate low-pass that begins at rest
     modes = s.part("low_pass", f"np.array({taus}), dt, rest={s.at('rest')}")
     return f"{x} + {modes}({d}) @ {s.group('c')}"
 
@@ -325,7 +327,7 @@ def _current(s: Slot, x: str, d: str) -> str:
 
 
 def _axes(s: Slot) -> dict[str, str]:
-    """Axis letter -> code of the input vector's component."""
+    """Return axis letter -> code of the input vector's component."""
     return {a: f'u["{name}"]' for a, name in vector_of(s.writer.signals).items()}
 
 
@@ -341,7 +343,7 @@ def _misalignment(s: Slot, x: str, d: str) -> str:
 
 
 def _here(s: Slot) -> dict[str, str]:
-    """Axis letter -> code of the vector where the sensor sits."""
+    """Return axis letter -> code of the vector at the sensor's position."""
     from tools.mismatch.twins.cluster import location
 
     vector = _axes(s)
@@ -413,13 +415,15 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "sensor_position_error": _elsewhere,
     "channel_delay": _delay,
 }
-"""How each effect of a signal path is written. Forces inside an equation of motion: ``FORCES``."""
+"""Writers of the effects of a signal path. ``FORCES`` has those of forces inside an equation of motion."""
 
 
 @dataclass(frozen=True)
 class ForceCode:
-    """What one force adds: ``smooth`` (code in position x and velocity v), ``limit`` of dry friction (code in v and
-    sign), ``stiff`` bristles and the ``lean`` of their loop, elastic elements that yield at ``radii`` with ``springs``.
+    """Holds the code of a force.
+
+    It consists of ``smooth`` (code in position x and velocity v), ``limit`` of dry friction (code in v and sign),
+    ``stiff`` bristles and the ``lean`` of their loop, and elastic elements that yield at ``radii`` with ``springs``.
     """
 
     smooth: str = ""
@@ -490,7 +494,7 @@ FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
 
 
 def written(slot: Slot, x: str, driver: str) -> str:
-    """The code of a signal ``x`` behind a placed effect; InputError for an effect of a package of the user's."""
+    """Return the code of a signal ``x`` behind a placed effect. Raises InputError for an effect of a user's package."""
     name = slot.placed.effect.name
     if name not in EXPRESSIONS:
         raise InputError(
@@ -500,7 +504,7 @@ def written(slot: Slot, x: str, driver: str) -> str:
 
 
 def force(slot: Slot) -> ForceCode:
-    """The code of a force; as ``written``."""
+    """Return the code of a force. Raises InputError as ``written`` does."""
     name = slot.placed.effect.name
     if name not in FORCES:
         raise InputError(f"{name}: has no numpy form to write as a force; use --out FILE.toml or FILE.csv")

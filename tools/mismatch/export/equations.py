@@ -1,4 +1,4 @@
-"""Differential equations of a corrected twin as lines of numpy code, forces and flows inside them included.
+"""Writes differential equations of a corrected twin as numpy code, with forces and flows inside them.
 
 The lines take the steps that ``twins.ode_run.run_equations`` takes, so that both runs agree to rounding.
 """
@@ -51,13 +51,13 @@ _BINARY = {ADD: ("+", 1, 1), SUB: ("-", 1, 2), MUL: ("*", 2, 2), DIV: ("/", 2, 3
 _COMPARED = {LESS: "<", LEQ: "<="}
 _ARGUMENTS = {ATAN2: 2, MIN: 2, MAX: 2, PICK: 3}
 ATOM = 9
-LONG = 60  # characters: longer derivatives stand on a line each
+LONG = 60  # number of characters above which each derivative has a line of its own
 TAKEN = ("s", "h", "t", "u", "p", "dt", "np")
-"""Names that the lines use themselves."""
+"""Reserved names of the generated lines."""
 
 
 def program_code(program: Program, names: Mapping[int, str]) -> tuple[list[str], list[str]]:
-    """Assignments of what is used more than once, and the code of each result. ``names``: code of the variables.
+    """Return assignments of shared subexpressions, and the code of each result. ``names``: code of the variables.
 
     Operations keep their order, so that rounding is that of the program.
     """
@@ -82,7 +82,7 @@ def program_code(program: Program, names: Mapping[int, str]) -> tuple[list[str],
     known: dict[int, tuple[str, int]] = {}
 
     def code_of(r: int) -> tuple[str, int]:
-        """Code and how tightly it holds together."""
+        """Return code and its precedence."""
         if r in names:
             return names[r], ATOM
         if r not in made:
@@ -104,7 +104,7 @@ def program_code(program: Program, names: Mapping[int, str]) -> tuple[list[str],
         code, given = int(made[r][0]), arguments(r)
         if code in _BINARY:
             sign, left, right = _BINARY[code]
-            # what stands on the right is worked out first
+            # the right operand is evaluated first
             return f"{within(given[0], left)} {sign} {within(given[1], max(right, left + 1))}", min(left, 3)
         if code in _COMPARED:
             return f"1.0 * ({within(given[0], 1)} {_COMPARED[code]} {within(given[1], 1)})", 2
@@ -118,7 +118,7 @@ def program_code(program: Program, names: Mapping[int, str]) -> tuple[list[str],
 
 @dataclass(frozen=True)
 class Inner:
-    """A force or flow as the lines need it: its place, its slot of parameters."""
+    """Describes a force or flow for the lines: its place and its slot of parameters."""
 
     place: Place
     slot: Slot
@@ -126,14 +126,14 @@ class Inner:
 
 @dataclass
 class EquationLines:
-    """Lines of an ode twin: ``setup`` defines ``moving(t, drive)``, ``run`` calls it and reads the outputs."""
+    """Writes the lines of an ode twin: ``setup`` defines ``moving(t, drive)``, ``run`` calls it and reads outputs."""
 
     twin: OdeTwin
     name: Callable[[str], str]
-    """A signal as a name in ``run``."""
+    """Returns the name of a signal in ``run``."""
     substeps: int
     gains: Mapping[str, float]
-    """What one unit of a force does to the derivative at its place."""
+    """Change of the derivative at the place of a force, per unit of the force."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.twin.equations, Programs):
@@ -142,7 +142,7 @@ class EquationLines:
         self.signals = tuple(self.twin.inputs)
 
     def see(self, inner: Sequence[Inner]) -> list[str]:
-        """The context signals that equations or parameters follow; the lines take these and the inputs."""
+        """Return the context signals that equations or parameters follow; the lines take these and the inputs."""
         first = 1 + len(self.twin.state_list)
         seen = {int(one.slot.placed.settings[PAIRS][1]) for one in inner if one.place.kind == "parameter"}
         for program in (self.programs.rates_program, self.programs.outputs):
@@ -156,20 +156,20 @@ class EquationLines:
         return {i: f"({n} * ({swayed[i]}))" if i in swayed else n for i, n in enumerate(every)}
 
     def run(self) -> list[str]:
-        """Lines that turn inputs into outputs."""
+        """Return the lines that turn inputs into outputs."""
         signals = [self.name(s) for s in self.twin.signals]
         drive = ", ".join(self.name(s) for s in self.signals)
         lines = [f"x = moving(t, np.stack([{drive}], axis=1))"]
         columns = [f"x[:, {i}]" for i in range(len(self.twin.state_list))]
         shared, read = program_code(self.programs.outputs, self._variables(columns, signals, {}))
         lines += shared
-        # all are read before a name of an output may hide an input of that name
-        # what depends on parameters alone has a value at every instant, too
+        # all inputs are read before an output of the same name may hide them
+        # outputs that depend on parameters alone need a value at every instant, too
         each = [r if "x[:" in r else f"{r} + 0 * t" for r in read]
         return [*lines, f"{', '.join(self.name(o) for o in self.twin.outputs)} = {', '.join(each)}"]
 
     def setup(self, inner: Sequence[Inner]) -> list[str]:
-        """Lines that define the equations and the steps; they go on where the last call stopped."""
+        """Return the lines that define equations and steps; they continue where the last call stopped."""
         twin = self.twin
         states = [f"{s.name}_" if s.name in TAKEN else s.name for s in twin.state_list]
         signals = [f"{s}_" if s in TAKEN else s for s in twin.signals]
@@ -215,7 +215,7 @@ class EquationLines:
         return lines
 
     def _forces(self, moved: Sequence[Inner]) -> tuple[list[str], list[str]]:
-        """Lines inside ``derivatives`` (``s``: states, ``h``: step), and those that define the steps."""
+        """Return the lines inside ``derivatives`` (``s``: states, ``h``: step), and those that define the steps."""
         by: dict[str, list[ForceCode]] = {}
         at: dict[str, Place] = {}
         for one in moved:

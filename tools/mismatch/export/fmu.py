@@ -1,4 +1,4 @@
-"""A corrected twin as an FMI 2.0 co-simulation FMU, built with PythonFMU around the exported Python module."""
+"""Builds a corrected twin as an FMI 2.0 co-simulation FMU, with PythonFMU around the exported Python module."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class {name}(Fmi2Slave):
 
 
 def check_pythonfmu() -> None:
-    """InputError where PythonFMU is not installed."""
+    """Raise InputError if PythonFMU is not installed."""
     if importlib.util.find_spec("pythonfmu") is None:
         raise InputError("an FMU is built with PythonFMU, which is not installed; install it, or use --out FILE.py")
 
@@ -85,8 +85,8 @@ def check_pythonfmu() -> None:
 def write_fmu(twin: Corrected, module: str, out: Path) -> None:
     """Build the FMU at ``out`` around the Python ``module`` of the twin.
 
-    Units are the twin's own (contract). InputError for a twin that is somebody's program, or a name that Python does
-    not allow.
+    Units are the twin's own (contract). Raises InputError for a twin that is a foreign program, or for a name that
+    Python does not allow.
     """
     if isinstance(twin.model.twin, OpaqueTwin):
         raise InputError(f"a {twin.kind} twin is a program of its own; use --out FILE.py, FILE.toml or FILE.csv")
@@ -108,7 +108,7 @@ def write_fmu(twin: Corrected, module: str, out: Path) -> None:
         inputs=(*twin.model.twin.inputs, *contexts), outputs=twin.model.twin.outputs, dt=rec.dt, name=name
     )
     with tempfile.TemporaryDirectory(prefix="micron-fmu-") as tmp:
-        # a process that runs two of them keeps Python modules by name
+        # a process that runs two such FMUs caches Python modules by name
         digest = hashlib.sha256(module.encode()).hexdigest()[:12]
         source = Path(tmp) / f"{name.lower()}_{digest}.py"
         source.write_text(module + slave, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A corrected twin as a Python module that needs numpy alone."""
+"""Writes a corrected twin as a Python module that needs numpy alone."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WIDTH = 110
 def python_module(
     recording: Recording, model: Model, theta: Array, file_units: Mapping[str, str], report: Sequence[str], start: Array
 ) -> str:
-    """The text of the module.
+    """Return the text of the module.
 
     ``file_units``: unit of each signal in the data file; ``report``: lines for its head; ``start``: the state of a
     dynamic twin at the first sample, in the coordinates of its text.
@@ -44,7 +44,7 @@ def python_module(
 
 
 def _name(signal: str) -> str:
-    """A signal as a Python name."""
+    """Return a signal as a Python name."""
     name = re.sub(r"\W", "_", signal)
     return f"_{name}" if name[:1].isdigit() or name in ("t", "u", "p", "dt", "np", "") else name
 
@@ -101,7 +101,7 @@ class _Module:
             value, unit = self.writer.parameters[key]
             stem = key.removeprefix(f"{self.labels[k]}.")
             if stem in weights or any(re.fullmatch(rf"{re.escape(stem)}_?\d+", w) for w in weights):
-                # weights before the base physics carry its gain inside the engine; here they are forces and inputs
+                # in the engine, weights before the base physics carry its gain; here they are forces and inputs
                 value = (np.asarray(value) / (gain * carried)).tolist()
                 if is_force:
                     unit = PER_FORCE.get(unit, unit)
@@ -109,8 +109,9 @@ class _Module:
         return slot
 
     def _through(self, site: str, between: bool = False) -> None:
-        """Lines for the effects in front of the base physics (``input``) or behind it (``output``), in order; those
-        between two filters come on their own.
+        """Write the effects in front of the base physics (``input``) or behind it (``output``), in order.
+
+        Effects between two filters are written separately.
         """
         for k in sorted(range(len(self.model.placed)), key=lambda k: STAGES.index(self.model.placed[k].stage)):
             pl = self.model.placed[k]
@@ -154,7 +155,7 @@ class _Module:
         self._through("output")
 
     def _moved(self, signal: str) -> bool:
-        """Return whether lines of the base physics name this input."""
+        """Return True if lines of the base physics name this input."""
         return self.twin.kind != "accelerometer_cluster" or not signal.startswith("angular_rate")
 
     def _static(self) -> None:
@@ -237,7 +238,7 @@ class _Module:
         start = 'np.array(p["start"])'
         forces = [k for k, pl in enumerate(self.model.placed) if pl.site == "feedback"]
         if hold == "smooth":
-            # what is known of an input ahead of time: no use step by step
+            # the future of an input is unknown step by step
             self.writer.used |= {"smoothed"}
             hold, drive = "linear", f"smoothed({drive})"
         if forces:
@@ -250,7 +251,7 @@ class _Module:
             add(f"{_name(o)} = {code}")
 
     def _first(self, twin: CascadeTwin) -> None:
-        """The filter in front of what stands between two, at rest before the record."""
+        """Write the first filter, in front of the effects between two filters; it starts at rest."""
         table: Mapping[str, Any] = self.base["first"]
         a, b, c, d = (f"np.array({self._put(f'first.{n}', table[n])})" for n in "ABCD")
         hold = "discrete" if self.base.get("discrete") else str(twin.hold)
@@ -294,7 +295,7 @@ class _Module:
     # -- text ---------------------------------------------------------------------------------------
 
     def text(self) -> str:
-        """The whole module."""
+        """Return the whole module."""
         w = self.writer
         self._base()
         outputs = ", ".join(f'"{o}": {_name(o)}' for o in self.twin.outputs)
@@ -321,8 +322,8 @@ class _Module:
         lines = [f'"""Corrected twin: {self.twin.kind} with {effects or "no effects"}. It needs numpy alone.', ""]
         lines += [f"Written by 'micron mismatch apply' for {rec.path.name}: {rec.title}".replace('"""', "'''"), ""]
         for role, names in (("inputs ", [*self.twin.inputs, *self._contexts()]), ("outputs", self.twin.outputs)):
-            said = [f"{s} ({self.file_units[s]}, column {rec.column[s]})" for s in names]
-            lines += textwrap.wrap(f"{role}  " + ", ".join(said), WIDTH, subsequent_indent=" " * 9)
+            described = [f"{s} ({self.file_units[s]}, column {rec.column[s]})" for s in names]
+            lines += textwrap.wrap(f"{role}  " + ", ".join(described), WIDTH, subsequent_indent=" " * 9)
         lines += [wrapped for line in self.report for wrapped in textwrap.wrap(line, WIDTH, subsequent_indent=" " * 9)]
         if isinstance(self.twin, DynamicTwin | OdeTwin | CascadeTwin):
             lines += ['"start" is the state at the first sample of that recording; another record begins elsewhere.']
@@ -335,8 +336,8 @@ class _Module:
     def _parameters(self) -> list[str]:
         lines = ["PARAMETERS = {"]
         for key, (value, unit) in self.writer.parameters.items():
-            shown = numbers(value) if not isinstance(value, str | Mapping) else repr(value)
-            lines.append(_wrapped(f"{_quoted(key)}: {shown},", 4) + (f"  # {unit}" if unit else ""))
+            value_text = numbers(value) if not isinstance(value, str | Mapping) else repr(value)
+            lines.append(_wrapped(f"{_quoted(key)}: {value_text},", 4) + (f"  # {unit}" if unit else ""))
         return [*lines, "}"]
 
     def _simulate(self, opaque: bool) -> list[str]:
@@ -379,7 +380,7 @@ class _Module:
 
 
 def _affine(unit: str, to: str) -> tuple[float, float]:
-    """(factor, shift) from a unit of the file to the twin's."""
+    """Return (factor, shift) from a unit of the file to the twin's."""
     if unit == to:
         return 1.0, 0.0
     zero, one = units.convert(np.array([0.0, 1.0]), unit, to).tolist()
@@ -395,7 +396,7 @@ def _quoted(key: str) -> str:
 
 
 def _wrapped(line: str, indent: int) -> str:
-    """A line of code; what is too long goes on below, its comment stands above."""
+    """Wrap a line of code that is too long; its comment moves above it."""
     code = line.strip()
     if not code:
         return ""
@@ -429,7 +430,7 @@ for _node in ast.parse(Path(parts.__file__).read_text(encoding="utf-8")).body:
 
 
 def _order(used: set[str]) -> list[str]:
-    """Functions that are used, with those that they call, in the order of ``parts``."""
+    """Return the used functions, with those that they call, in the order of ``parts``."""
     every = set(used)
     while True:
         more = {n for n in SOURCES for u in every if re.search(rf"\b{n}\(", SOURCES[u])} - every

@@ -1,4 +1,4 @@
-"""The equation of motion of a twin with forces as lines of numpy code."""
+"""Writes the equation of motion of a twin with forces as lines of numpy code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tools.mismatch.twins.feedback import pack
 
 
 def substeps_of(twin: DynamicTwin, model: Model, theta: Array, recording: Recording, forces: Sequence[int]) -> int:
-    """Steps per sample that the engine takes with these forces."""
+    """Return the steps per sample that the engine takes with these forces."""
     if twin.hold == "discrete":
         return 1
     placed = [(model.placed[k], *model.slices(k)) for k in forces]
@@ -38,9 +38,9 @@ def substeps_of(twin: DynamicTwin, model: Model, theta: Array, recording: Record
 def motion(
     codes: Sequence[ForceCode], a: str, b: str, place: str, speed: str, hold: str, start: str, substeps: int
 ) -> list[str]:
-    """Lines of ``moving(drive)``: a linear plant with forces of its position x and velocity v in free run.
+    """Return the lines of ``moving(drive)``: a linear plant with forces of its position x and velocity v in free run.
 
-    The scheme is that of ``twins.feedback.run_feedback``, written out for the forces that there are.
+    The scheme is that of ``twins.feedback.run_feedback``, written out for the forces of the twin.
     """
     smooth = "".join(c.smooth for c in codes)
     limits = [c.limit for c in codes if c.limit]
@@ -108,7 +108,7 @@ def motion(
 
 
 def bend_code(lean: str, head: str, since: str) -> list[str]:
-    """Lines of the deflection of bristles after ``since`` seconds at the speed v; ``lean``: code of that of a loop."""
+    """Return lines for the deflection of bristles after ``since`` seconds at speed v; ``lean``: code of the lean."""
     if lean:
         return [
             f"{head}  # Bouc-Wen: z' = v - stiff (|v| z + lean v |z|) / limit, exact for constant v",
@@ -130,5 +130,5 @@ def bend_code(lean: str, head: str, since: str) -> list[str]:
 
 
 def sum_code(terms: str) -> str:
-    """Code of a sum whose first term has its sign before a blank."""
+    """Return the code of a sum whose first term has its sign before a blank."""
     return "-" + terms[2:] if terms.startswith("- ") else terms.removeprefix("+ ")

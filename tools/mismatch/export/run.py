@@ -1,4 +1,4 @@
-"""A corrected twin of any kind of file, loaded and run again by one call: ``simulate_file(twin, recording)``."""
+"""Loads and runs a corrected twin from any kind of file: ``simulate_file(twin, recording)``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KINDS = (".toml", ".py", ".fmu")
 
 @dataclass(frozen=True)
 class Residual:
-    """Rms of recorded minus simulated, of one output in the unit of the file; ``where`` says over which samples."""
+    """Holds the rms of recorded minus simulated of an output, in the unit of the file; ``where`` names the samples."""
 
     output: str
     unit: str
@@ -34,12 +34,12 @@ class Residual:
     where: str
 
     def as_dict(self) -> dict[str, object]:
-        """The row of the command's JSON."""
+        """Return the row of the command's JSON."""
         return asdict(self)
 
 
 def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
-    """The residual of each output over the whole recording, and over its test range where ``[split]`` gives one."""
+    """Return the residual of each output over the whole recording, and over its test range if ``[split]`` has one."""
     rows: list[Residual] = []
     parts = {"": (0, recording.n)}
     test = recording.split.test
@@ -55,11 +55,11 @@ def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual
 
 
 def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
-    """The outputs (n,) of a twin over a whole recording, by signal, in the units of the recording's file.
+    """Return the outputs (n,) of a twin over a whole recording, by signal, in the units of the recording's file.
 
-    ``twin``: what ``micron mismatch apply`` wrote (.toml, .py or .fmu). It runs freely: measured outputs set the state
-    at the first samples of a .toml twin with states, and nothing else; a .py twin begins as it was written.
-    RecordingError says what is wrong with either file.
+    ``twin`` is a file of ``micron mismatch apply`` (.toml, .py or .fmu). It runs freely: measured outputs set only the
+    state at the first samples of a .toml twin with states; a .py twin has its written start state. Raises
+    RecordingError for a fault of either file.
     """
     path, rec = Path(twin), load(recording)
     if not path.is_file():
@@ -81,18 +81,18 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
 
 
 def free_run(recording: Recording) -> dict[str, Array]:
-    """The outputs (n,) of the twin that a recording names, in its own units: one free run over the whole recording."""
+    """Return the outputs (n,) of the twin that a recording names, in its own units, of a free run over all samples."""
     twin = make(recording)
     return whole_run(recording, Model(twin), twin.start(recording))
 
 
 def whole_run(recording: Recording, model: Model, theta: Array) -> dict[str, Array]:
-    """The outputs (n,) of a model in one free run; the first samples that a diagnosis would use set its state."""
+    """Return the outputs (n,) of a model in a free run; the first samples that a diagnosis would use set its state."""
     return model.simulate(whole_view(recording, model), theta)
 
 
 def whole_view(recording: Recording, model: Model) -> View:
-    """The whole recording as one free run, with the first samples that a diagnosis would use to set its state."""
+    """Return the whole recording as a free run whose state is set by the first samples that a diagnosis would use."""
     from tools.mismatch.engine.pose import free_run as course
 
     init = recording.split.initialization or course(recording, model.twin)[1]
@@ -100,12 +100,12 @@ def whole_view(recording: Recording, model: Model) -> View:
 
 
 def in_file_units(recording: Recording) -> dict[str, Array]:
-    """Inputs and context signals (n,) in the units of the data file."""
+    """Return inputs and context signals (n,) in the units of the data file."""
     return {s: units.convert(x, recording.unit[s], recording.file_unit[s]) for s, x in recording.signals.items()}
 
 
 def _run_module(path: Path, recording: Recording) -> dict[str, Array]:
-    """Return what ``simulate`` of a Python twin returns, run in a process of its own."""
+    """Return the outputs of ``simulate`` of a Python twin, run in a process of its own."""
     source = trusted_program(path, path).decode("utf-8", "replace")
     opening = {"ask": "open_module", "path": str(path), "source": source, "dt": recording.dt}
     guest = GuestProcess(str(path), opening)
@@ -124,7 +124,7 @@ def _run_module(path: Path, recording: Recording) -> dict[str, Array]:
 
 
 def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
-    """The outputs (n,) of an FMU in the units of the recording's file; those of an FMU are the recording's own."""
+    """Return the outputs (n,) of an FMU in the units of the recording's file; the FMU uses the recording's own."""
     fmu = FmuRun(path, tuple(recording.outputs), recording.dt)
     known = fmu.names()
     signals = {s: x for s, x in recording.signals.items() if s in known}
@@ -136,7 +136,7 @@ def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
 
 
 def _of(path: Path, recording: Recording, found: Mapping[str, Any]) -> dict[str, Array]:
-    """The outputs of the recording among those that a twin returned."""
+    """Return the outputs of the recording among those that a twin returned."""
     lost = [o for o in recording.outputs if o not in found]
     if lost:
         raise RecordingError(f"{path}: returned no output {', '.join(lost)}; it gives {', '.join(found) or 'none'}")

@@ -1,4 +1,4 @@
-"""Write a corrected twin in the form that the file's name asks for: .toml, .py, .fmu or .csv."""
+"""Writes a corrected twin in the format of the file's extension: .toml, .py, .fmu or .csv."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ FORMATS = {
     ".fmu": "an FMI 2.0 co-simulation (needs PythonFMU)",
     ".csv": "inputs, recorded and simulated outputs, in columns",
 }
-START_SAMPLES = 400  # of the engine's run that the start state of a module is matched to
+START_SAMPLES = 400  # number of samples of the engine's run to which the start state of a module is fitted
 
 
 def check_format(out: Path) -> None:
-    """InputError for a file name that says no format, or one that cannot be written here."""
+    """Raise InputError for a file name without a known extension, or a format that cannot be written here."""
     if out.suffix.lower() not in FORMATS:
         known = "; ".join(f"{k}: {v}" for k, v in FORMATS.items())
         raise InputError(f"{out}: the ending says the format, and '{out.suffix}' is none ({known})")
@@ -48,7 +48,7 @@ def check_format(out: Path) -> None:
 
 
 def write_twin(twin: Corrected, report: Mapping[str, Any], out: Path) -> None:
-    """Write ``twin`` to ``out``; InputError for what its kind or its effects do not allow."""
+    """Write ``twin`` to ``out``. Raises InputError if its kind or its effects do not allow the format."""
     check_format(out)
     match out.suffix.lower():
         case ".toml":
@@ -70,18 +70,18 @@ def write_twin(twin: Corrected, report: Mapping[str, Any], out: Path) -> None:
 
 
 def module_of(twin: Corrected, report: Mapping[str, Any]) -> str:
-    """The twin as a Python module, its start state that of the recording."""
+    """Return the twin as a Python module with the start state of the recording."""
 
     def text(part: Corrected, start: Array) -> str:
         rec = part.recording
-        return python_module(rec, part.model, part.theta, rec.file_unit, _said(report), start)
+        return python_module(rec, part.model, part.theta, rec.file_unit, _report_lines(report), start)
 
     if isinstance(twin.model.twin, OdeTwin):
         return text(twin, twin.model.start_states(whole_view(twin.recording, twin.model), twin.theta))
     order = order_of(twin)
     if order == 0:
         return text(twin, np.zeros(0))
-    # what comes behind the states does not set them, and forces are small over a few samples
+    # effects behind the states do not set them, and forces are small over a few samples
     free = [part_of(twin, [pl for pl in twin.model.placed if pl.site in sites]) for sites in (FORCED, ("input",))]
     run, linear = (runnable(text(part, np.zeros(order))) for part in free)
     return text(twin, start_state(run, linear, free[0], order))
@@ -91,20 +91,20 @@ FORCED = ("input", "feedback")
 
 
 def part_of(twin: Corrected, placed: Sequence[Placed]) -> Corrected:
-    """The twin with some of its effects."""
+    """Return the twin with some of its effects."""
     model = Model(twin.model.twin, placed)
     return replace(twin, model=model, theta=model.carry(twin.model, twin.theta, twin.recording))
 
 
 def runnable(module: str) -> Any:
-    """``simulate`` of the text of a module."""
+    """Return ``simulate`` of the text of a module."""
     space: dict[str, Any] = {}
     exec(compile(module, "twin.py", "exec"), space)
     return space["simulate"]
 
 
 def order_of(twin: Corrected) -> int:
-    """Number of states of the text of a twin."""
+    """Return the number of states of the text of a twin."""
     core = twin.model.twin
     if isinstance(core, CascadeTwin):
         return len(np.asarray(core.to_text(twin.theta)["A"]))
@@ -115,9 +115,9 @@ def order_of(twin: Corrected) -> int:
 
 
 def start_state(run: Any, linear: Any, twin: Corrected, order: int) -> Array:
-    """The state (order,) from which ``run`` follows the engine's own free run of the recording.
+    """Fit the state (order,) from which ``run`` reproduces the engine's own free run of the recording.
 
-    ``linear``: the same without forces, whose response to a change of the state is known.
+    ``linear`` is the run without forces, whose response to a change of the state is known.
     """
     rec = twin.recording
     wanted = whole_run(rec, twin.model, twin.theta)
@@ -164,8 +164,8 @@ def start_state(run: Any, linear: Any, twin: Corrected, order: int) -> Array:
     return x
 
 
-def _said(report: Mapping[str, Any]) -> list[str]:
-    """Return what the report says of each effect, under its own names and units."""
+def _report_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the report's lines on each effect, under its own names and units."""
     lines: list[str] = []
     for p in report.get("physics", []):
         values = [
@@ -188,7 +188,7 @@ def _figure(value: object) -> str:
 
 
 def columns(recording: Recording, simulated: Mapping[str, Array]) -> str:
-    """The text of a csv: time, inputs, recorded outputs, simulated outputs, in the units and names of the data file."""
+    """Return a csv of time, inputs, recorded and simulated outputs, in the units and names of the data file."""
     found = in_file_units(recording)
     measured = {o: units.convert(y, recording.unit[o], recording.file_unit[o]) for o, y in recording.outputs.items()}
     table = {recording.column[s]: found[s] for s in recording.inputs}

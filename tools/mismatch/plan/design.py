@@ -1,7 +1,7 @@
-"""The input that best separates rival models: maximise the least separation of any two over families of waveforms.
+"""Designs the input that separates rival models best: it maximises the least separation of any two over waveforms.
 
-The criterion is expensive and has many optima, so the search is plain: described inputs and random points of every
-family on a thinned budget, then a (1 + 1) evolution strategy with the one-fifth rule (Rechenberg 1973) from the best.
+The criterion is expensive and has many optima, so the search is simple: described inputs and random points of every
+family on a reduced budget, then a (1 + 1) evolution strategy with the one-fifth rule (Rechenberg 1973) from the best.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ RANDOM_PER_FAMILY = 3
 REFINED = 2
 FINALISTS = 4
 QUICK, FULL = 4, 25
-"""Iterations of the rival's re-fit while candidates are compared, and for the figures that are printed."""
+"""Number of iterations of a rival's re-fit during the comparison of candidates, and for the printed figures."""
 COMPARED = 5
-"""Random multisines of equal energy whose median separation is printed beside the plan."""
+"""Number of random multisines of equal energy whose median separation is printed beside the plan."""
 ENERGIES_SEED = 77
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned input: ``waves[signal]`` (n,), the least separation of any two rivals in standard deviations, that of
-    random multisines of equal energy (median). ``description`` names the family.
+    """Holds a planned input ``waves[signal]`` (n,) and the least separation of any two rivals in standard deviations.
+
+    It also has the median of that separation for random multisines of equal energy; ``description`` names the family.
     """
 
     waves: Mapping[str, Array]
@@ -106,7 +107,7 @@ def design(
             else:
                 step = max(step * 1.5**-0.25, 0.01)
         ends.append(now)
-    # a search that was cut short makes an input look better than it is: the finalists are followed to the end
+    # an incomplete search overestimates an input, so the finalists are followed to convergence
     judged = [(pair_distances(where, rivals, waves(p.family, p.z), sigma), p) for p in ends]
     pairs, best = max(judged, key=lambda found: min(found[0].values()))
     chosen = waves(best.family, best.z)
@@ -123,7 +124,7 @@ def design(
 
 
 def _unlike(points: Sequence[_Point], count: int) -> list[_Point]:
-    """The best points of different families."""
+    """Return the best points of different families."""
     out: list[_Point] = []
     for p in points:
         if p.family not in {q.family for q in out}:
@@ -134,7 +135,7 @@ def _unlike(points: Sequence[_Point], count: int) -> list[_Point]:
 def pair_distances(
     where: Situation, rivals: Sequence[Rival], waves: Mapping[str, Array], sigma: Mapping[str, float]
 ) -> dict[str, float]:
-    """The separation of each unordered pair, by "one / other"."""
+    """Return the separation of each unordered pair, by "one / other"."""
     course = where.course(waves)
     return {
         f"{a.name} / {b.name}": separation(course, (a, b), sigma, FULL, thorough=True)
@@ -146,7 +147,7 @@ def pair_distances(
 def random_inputs(
     waves: Mapping[str, Array], limits: Mapping[str, Limits], dt: float, rng: np.random.Generator
 ) -> dict[str, Array]:
-    """A random multisine for each input, with the energy of the planned one."""
+    """Return a random multisine for each input, with the energy of the planned one."""
     return {s: random_multisine(rng, limits[s], dt, mean_square(x, limits[s])) for s, x in waves.items()}
 
 
@@ -158,7 +159,7 @@ def random_separation(
     sigma: Mapping[str, float],
     seed: int,
 ) -> float:
-    """The median separation on random multisines of equal energy."""
+    """Return the median separation on random multisines of equal energy."""
     rng = np.random.default_rng([seed, ENERGIES_SEED])
     found = [
         separation(where.course(random_inputs(waves, limits, where.dt, rng)), rivals, sigma, FULL, thorough=True)

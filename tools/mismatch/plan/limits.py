@@ -1,4 +1,4 @@
-"""Limits of an input: amplitude about a centre, rate, band and duration, in the channel's unit."""
+"""Determines the limits of an input: amplitude about a centre, rate, band and duration, in the channel's unit."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from tools.mismatch.recording import Array
 
 LEAST_SAMPLES = 200
 MOST_SAMPLES = 60_000
-"""Samples of a plan. Every candidate input is simulated with every model, some hundred times."""
+"""Largest number of samples of a plan. Every candidate input is simulated with every model, some hundred times."""
 BAND_SHARE = 0.1
 """Highest frequency of a default band, as a share of the sampling rate."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The input stays within ``centre`` +- ``amplitude``, moves by at most ``rate_per_s`` and lasts ``duration_s``;
-    ``band_hz`` bounds the frequencies of sinusoids and the inverse of the shortest hold. ``rms`` bounds its energy: the
-    rms about the centre.
+    """Limits an input to ``centre`` +- ``amplitude``, the rate ``rate_per_s`` and the duration ``duration_s``.
+
+    ``band_hz`` bounds the frequencies of sinusoids and the inverse of the shortest hold; ``rms`` bounds the rms about
+    the centre, and so the energy.
     """
 
     unit: str
@@ -38,7 +39,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Wish:
-    """Holds what a person asked for. None stands for the default."""
+    """Holds the limits that a person requested. None stands for the default."""
 
     amplitude: float | None = None
     centre: float | None = None
@@ -49,12 +50,12 @@ class Wish:
 
 
 def limits_json(limits: Limits) -> dict[str, Any]:
-    """JSON values; an energy without a bound is null."""
+    """Return JSON values; an energy without a bound is null."""
     return {**asdict(limits), "rms": limits.rms if np.isfinite(limits.rms) else None}
 
 
 def parse_band(text: str | None) -> tuple[float, float] | None:
-    """``LOW:HIGH`` in Hz."""
+    """Parse ``LOW:HIGH`` in Hz."""
     if text is None:
         return None
     found = re.fullmatch(r"([0-9.eE+-]+):([0-9.eE+-]+)", text)
@@ -70,9 +71,9 @@ def parse_band(text: str | None) -> tuple[float, float] | None:
 def settle_limits(
     wish: Wish, unit: str, dt: float, recorded: Array | None, where: str, bench: Mapping[str, float] | None
 ) -> Limits:
-    """The limits of one input: what was asked for, else those of the recorded course, else those of the bench.
+    """Return the limits of an input: the requested ones, else those of the recorded course, else those of the bench.
 
-    InputError for a wish that is impossible at this sampling rate or beyond the bench.
+    Raises InputError for a request that is impossible at this sampling rate or beyond the bench.
     """
     for option, value in (
         ("--amplitude", wish.amplitude),
@@ -113,7 +114,7 @@ def settle_limits(
 
 
 def bench_limits(file: BenchFile) -> dict[str, float]:
-    """The output's range, neutral voltage and slew limit (V, V/s) of a bench; InputError for a bench without output."""
+    """Return output range, neutral voltage and slew limit (V, V/s) of a bench. Raises InputError without an output."""
     from firmware_py.actuation.config import ActuationConfig
 
     output = next((d.model_dump() for d in file.description.device.values() if "neutral_V" in d.model_dump()), None)
@@ -129,7 +130,7 @@ def bench_limits(file: BenchFile) -> dict[str, float]:
 
 
 def check_bench(centre: float, amplitude: float, rate: float, unit: str, bench: Mapping[str, float]) -> None:
-    """InputError for limits that the bench's output does not allow."""
+    """Raise InputError for limits that the bench's output does not allow."""
     low, high = centre - amplitude, centre + amplitude
     if low < bench["low"] - 1e-9 or high > bench["high"] + 1e-9:
         most = min(bench["high"] - centre, centre - bench["low"])

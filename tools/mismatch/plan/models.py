@@ -1,4 +1,4 @@
-"""Rival models and how far apart they are: the distance of one from another that may re-fit itself.
+"""Measures how far apart rival models are: the distance of one from another that may re-fit itself.
 
 The distance of ``b`` from ``a`` at an input is ``D = sqrt(min over b's parameters of sum ((y_a - y_b) / sigma)^2)``, in
 standard deviations of the noise (Hunter and Reiner 1965; T-optimality: Atkinson and Fedorov 1975). Half its square is
@@ -24,7 +24,7 @@ from tools.mismatch.simulate_start import prepare, starts
 
 @dataclass(frozen=True)
 class Rival:
-    """A twin with effects, at the parameters that met what was recorded so far. ``name``: its effects."""
+    """Holds a twin with effects at the parameters that fit the recordings so far. ``name`` lists its effects."""
 
     name: str
     placed: tuple[Placed, ...]
@@ -34,8 +34,9 @@ class Rival:
 def distance(
     course: Recording, a: Rival, b: Rival, sigma: Mapping[str, float], iterations: int = 8, *, thorough: bool = False
 ) -> float:
-    """Return how far ``b`` stays from ``a`` on the inputs of ``course`` after it has re-fitted itself, in standard
-    deviations. Zero where a model runs away: such an input is of no use. ``thorough``: see ``refit``.
+    """Return the distance of ``b`` from ``a`` on the inputs of ``course`` after its re-fit, in standard deviations.
+
+    The distance is zero if a model diverges, because such an input is useless. ``thorough``: see ``refit``.
     """
     problem = problem_of(course, sigma)
     truth = simulated(course, Model(problem.twin, a.placed), a.theta)
@@ -48,12 +49,12 @@ def distance(
 def refit(
     recording: Recording, rival: Rival, sigma: Mapping[str, float], iterations: int = 8, *, thorough: bool = False
 ) -> Fit:
-    """``rival`` fitted to a recording with all its parameters, those of the twin as well.
+    """Fit ``rival`` to a recording with all its parameters, those of the twin as well.
 
-    The search begins at the rival's own parameters and at those that the recording itself suggests for each effect: a
-    search from one start may end in another valley, which makes two models look further apart than they are.
-    ``thorough``: each start is followed to its end, once more with settings of the effects that are read off this
-    recording, as a new diagnosis would.
+    The search begins at the rival's own parameters and at those that the recording suggests for each effect, because a
+    search from a single start may end in a local optimum and overestimate the distance of two models. ``thorough``:
+    each start is followed to convergence, and once more with settings of the effects that are read off this recording,
+    as a new diagnosis would do.
     """
     problem = problem_of(recording, sigma)
     model = Model(problem.twin, rival.placed)
@@ -74,8 +75,9 @@ def refit(
 
 
 def _with_new_settings(problem: Problem, model: Model, theta: Array) -> tuple[Model, list[Array]] | None:
-    """The model with the settings of its last effect read off the problem's recording, and where a search begins; None
-    where the settings stay as they are.
+    """Return the model with the settings of its last effect read off the problem's recording, and its starts.
+
+    Returns None if the settings do not change.
     """
     if not model.placed:
         return None
@@ -94,7 +96,7 @@ def _or_infinite(value: float) -> float:
 
 
 def squares(found: Fit, sigma: Mapping[str, float]) -> float:
-    """Sum of the squared residuals of a fit in noise variances, over all outputs."""
+    """Return the sum of squared residuals of a fit in noise variances, over all outputs."""
     return float(sum(np.sum((r / sigma[o]) ** 2) for o, r in found.residual.items()))
 
 
@@ -102,7 +104,7 @@ def separation(
     course: Recording, rivals: Sequence[Rival], sigma: Mapping[str, float], iterations: int = 8, floor: float = -1.0,
     *, thorough: bool = False,
 ) -> float:  # fmt: skip
-    """The least separation of any two rivals (``joint``). Ends early once a pair is not above ``floor``."""
+    """Return the least separation of any two rivals (``joint``). Ends early once a pair is not above ``floor``."""
     least = math.inf
     for i, a in enumerate(rivals):
         for b in rivals[i + 1 :]:
@@ -113,20 +115,20 @@ def separation(
     return least
 
 
-def joint(there: float, back: float) -> float:
-    """One separation for the distances of two models from each other.
+def joint(forward: float, back: float) -> float:
+    """Combine the distances of two models from each other to a separation, by the geometric mean of ``1 + D^2``.
 
-    Either may be true, so one direction must not stand for the other: the geometric mean of ``1 + D^2``. It is ``D``
-    where both are alike. Where one model contains the other, the latter is at no distance from it on any input, and the
-    other direction alone is left to be made large.
+    Either model may be true, so both directions count. The separation is ``D`` where both distances are equal. If one
+    model contains the other, the distance of the larger one is zero on any input and the other direction alone counts.
     """
-    return math.sqrt(math.sqrt((1.0 + there**2) * (1.0 + back**2)) - 1.0)
+    return math.sqrt(math.sqrt((1.0 + forward**2) * (1.0 + back**2)) - 1.0)
 
 
 def log_ratio(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, float]) -> float:
-    """Log likelihood of ``a`` less that of ``b`` on a recording, both re-fitted (normal noise, its rms as stated), with
-    half the logarithm of the number of samples as the price of a parameter (Schwarz 1978): a model that contains the
-    other one must earn what it is free to follow.
+    """Return the log likelihood of ``a`` less that of ``b`` on a recording, both re-fitted (normal noise of known rms).
+
+    Each parameter costs half the logarithm of the number of samples (Schwarz 1978), so that a model that contains the
+    other has no advantage by its freedom alone.
     """
     found = [refit(recording, r, sigma, iterations=25, thorough=True) for r in (a, b)]
     left = [squares(f, sigma) for f in found]
@@ -135,6 +137,6 @@ def log_ratio(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, floa
 
 
 def fitted_rival(problem: Problem, name: str, placed: Sequence[Placed], starts: Sequence[Array]) -> Rival | None:
-    """``placed`` fitted to what was recorded, from ``starts``; None where no fit is finite."""
+    """Fit ``placed`` to the recording, from ``starts``; return None if no fit is finite."""
     found = fit(problem, Model(problem.twin, placed), starts)
     return Rival(name, tuple(placed), found.theta) if found.ok and np.isfinite(found.cost) else None

@@ -1,4 +1,4 @@
-"""The command ``micron mismatch plan``: what could be told apart, and the input that splits what a report could not."""
+"""Implements ``micron mismatch plan``: the distinguishable effects, and the input that separates equivalent ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tools.mismatch.plan.situation import Situation, situation
 
 @dataclass(frozen=True)
 class Asked:
-    """Holds what the command line says beside the twin. ``inputs``: signals to be designed (none: all)."""
+    """Holds the options of the command line. ``inputs``: signals to be designed (none: all)."""
 
     wish: Wish = field(default_factory=Wish)
     inputs: tuple[str, ...] = ()
@@ -36,9 +36,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Prospect:
-    """Holds what could be told apart before anything more is recorded. ``channels``: for each context channel that is
-    not recorded, the effects that could be named with it; ``places``: groups of places that structure cannot split,
-    with the unknowns that would.
+    """Holds the effects that could be distinguished before anything more is recorded.
+
+    ``channels``: for each context channel that is not recorded, the effects that could be named with it; ``places``:
+    groups of places that structure cannot split, with the unknowns that would.
     """
 
     where: Situation
@@ -50,14 +51,15 @@ class Prospect:
     isolable: tuple[tuple[str, ...], ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON of the command."""
+        """Return the JSON of the command."""
         unit = self.where.template.unit
+        found = {"shown" if k == "visible" else k: v for k, v in asdict(self.found).items()}
         return {
             "format": 1,
             "twin": str(self.where.path),
             "limits": {s: limits_json(box) for s, box in self.limits.items()},
             "noise_rms": {o: {"value": v, "unit": unit[o]} for o, v in self.sigma.items()},
-            **asdict(self.found),
+            **found,
             "channels": {s: list(names) for s, names in self.channels.items()},
             "structure": {
                 "groups": [list(g) for g in self.isolable],
@@ -68,7 +70,7 @@ class Prospect:
 
 @dataclass(frozen=True)
 class Designed:
-    """A plan for a group of equivalent effects."""
+    """Holds a plan for a group of equivalent effects."""
 
     where: Situation
     group: tuple[str, ...]
@@ -94,7 +96,7 @@ class Designed:
 
 
 def open_situation(path: Path, asked: Asked) -> Situation:
-    """The situation of the command line; a stated noise stands for what no channel declares."""
+    """Return the situation of the command line; the stated noise is used for channels that declare none."""
     where = situation(path, asked.noise, asked.rate_hz)
     if asked.noise is None:
         return where
@@ -104,7 +106,7 @@ def open_situation(path: Path, asked: Asked) -> Situation:
 
 
 def limits_of(where: Situation, asked: Asked) -> dict[str, Limits]:
-    """The limits of every input that is to be designed, in the twin's units."""
+    """Return the limits of every input to be designed, in the twin's units."""
     rec = where.template
     unknown = [s for s in asked.inputs if s not in rec.inputs]
     if unknown:
@@ -131,7 +133,7 @@ def _in_twin_units(wish: Wish, given: str, to: str) -> Wish:
 
 
 def prospect(path: Path, asked: Asked) -> Prospect:
-    """Return what the twin's channels could tell apart. InputError or RecordingError says what is wrong."""
+    """Return the effects that the twin's channels could distinguish. Raises InputError or RecordingError on a fault."""
     where = open_situation(path, asked)
     limits = limits_of(where, asked)
     sigma = {o: where.noise(o, {}) for o in where.template.outputs}
@@ -151,7 +153,7 @@ def prospect(path: Path, asked: Asked) -> Prospect:
 
 
 def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Progress | None = None) -> Designed:
-    """The input that splits the first group of a report that can be fitted. InputError where there is none."""
+    """Design the input that splits the first group of a report that can be fitted. Raises InputError without one."""
     where = open_situation(path, asked)
     limits = limits_of(where, asked)
     floors = noise_of(report)
@@ -173,5 +175,5 @@ def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Prog
 
 
 def words(names: Sequence[str]) -> str:
-    """Names of effects as people read them."""
+    """Return names of effects for people."""
     return ", ".join(n.replace("_", " ") for n in names)

@@ -1,7 +1,8 @@
-"""Computes what an input would show of each effect: its response beside what base parameters imitate, and tangents.
+"""Computes the response of an input to each effect, with base parameters projected out, and its tangents.
 
-Everything is computed at the twin, by simulation: an effect is put in at a size, the outputs move, and what a re-fit of
-the base parameters takes back is projected out. ``rows`` are samples of all outputs, in noise standard deviations.
+Everything is computed at the twin by simulation: an effect is added at a size, the outputs change, and the part that a
+re-fit of the base parameters absorbs is projected out. ``rows`` are samples of all outputs, in noise standard
+deviations.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, starts
 
 ROWS = 3000
-"""Rows of an output that are compared."""
+"""Number of rows of an output that are compared."""
 GRID = (0.02, 0.1, 0.25, 0.45, 0.65, 0.85)
 """Points between the bounds of a searched parameter at which an effect is tried."""
 MOST_STARTS = 4
@@ -35,9 +36,11 @@ OWN_EVENTS = frozenset(("spikes", "dropped_samples", "quantization", "step_shift
 
 @dataclass(frozen=True)
 class Response:
-    """An effect at a place. ``move`` (rows,): its typical response of unit norm, base parameters projected out;
-    ``norm_per_rms``: norm of that response for an effect whose rms on its output is one noise rms; ``tangents``: spaces
-    (rows, k), orthonormal, of what it can do around several of its parameters.
+    """Holds the response of an effect at a place.
+
+    ``move`` (rows,) is its typical response of unit norm, base parameters projected out; ``norm_per_rms`` is the norm
+    of that response for an effect whose rms on its output is one noise rms; ``tangents`` are orthonormal bases (rows,
+    k) of its possible responses around several of its parameters.
     """
 
     effect: Effect
@@ -49,8 +52,9 @@ class Response:
 
 @dataclass(frozen=True)
 class Ground:
-    """A twin on an input: the problem at the twin, its outputs, the compared rows and the space (rows, k) of what the
-    base parameters do."""
+    """Holds a twin on an input: the problem, its outputs, the compared rows and a basis (rows, k) of the responses to
+    base parameters.
+    """
 
     problem: Problem
     model: Model
@@ -61,19 +65,19 @@ class Ground:
     sigma: Mapping[str, float]
 
     def stack(self, moves: Mapping[str, Array]) -> Array:
-        """Movements of the outputs (n,) as one column of rows."""
+        """Stack movements of the outputs (n,) to a column of rows."""
         zero = np.zeros(self.rows.size)
         return np.concatenate(
             [moves[o][self.rows] / self.sigma[o] if o in moves else zero for o in self.problem.twin.outputs]
         )
 
     def less_base(self, columns: Array) -> Array:
-        """``columns`` less what the base parameters can imitate."""
+        """Return ``columns`` less the part that base parameters can imitate."""
         return columns - self.base @ (self.base.T @ columns)
 
 
 def ground(course: Recording, sigma: Mapping[str, float], seed: int = 0) -> Ground:
-    """The twin on the inputs of ``course``, its outputs with noise as a recording of its own."""
+    """Return the twin on the inputs of ``course``, with its noisy outputs as the recording."""
     problem = problem_of(course, sigma, seed)
     model = Model(problem.twin)
     theta = problem.twin.start(course) if problem.twin.parameters else np.zeros(0)
@@ -90,7 +94,7 @@ def ground(course: Recording, sigma: Mapping[str, float], seed: int = 0) -> Grou
 
 
 def _columns(on: Ground, model: Model, theta: Array, which: Iterable[int], now: Mapping[str, Array]) -> list[Array]:
-    """Return how the outputs move with parameters ``which`` of a model, each as one column of rows."""
+    """Return the derivatives of the outputs with respect to parameters ``which`` of a model, a column of rows each."""
     wanted = list(which)
     design = model.design(on.problem.view, theta)
     out: list[Array] = []
@@ -99,15 +103,15 @@ def _columns(on: Ground, model: Model, theta: Array, which: Iterable[int], now: 
             out.append(on.stack({o: design.columns[o][:, js.index(i)] for o, js in design.linear.items() if i in js}))
             continue
         shifted = moved_a_little(model, theta, i)
-        there = simulated(on.problem.recording, model, shifted)
+        after = simulated(on.problem.recording, model, shifted)
         step = shifted[i] - theta[i]
         if step != 0.0:
-            out.append(on.stack({o: (there[o] - now[o]) / step for o in now}))
+            out.append(on.stack({o: (after[o] - now[o]) / step for o in now}))
     return [c for c in out if np.all(np.isfinite(c))]
 
 
 def orthonormal(columns: Array) -> Array:
-    """An orthonormal basis (rows, k) of what the columns span."""
+    """Return an orthonormal basis (rows, k) of the span of the columns."""
     size = np.linalg.norm(columns, axis=0)
     kept = columns[:, size > 1e-12 * max(float(size.max(initial=0.0)), 1e-300)]
     if kept.shape[1] == 0:
@@ -117,9 +121,9 @@ def orthonormal(columns: Array) -> Array:
 
 
 def responses(on: Ground, effects: Iterable[Effect], size: float) -> list[Response]:
-    """The response of every effect at its likeliest place, at an rms of ``size`` noise rms on the output.
+    """Return the response of every effect at its most likely place, at an rms of ``size`` noise rms on the output.
 
-    Effects that this input does not move are left out.
+    Effects that this input does not excite are left out.
     """
     out: list[Response] = []
     for effect in effects:
@@ -162,7 +166,7 @@ def _response(on: Ground, place: Placed, size: float) -> Response | None:
         norm = float(np.linalg.norm(v))
         if rms <= 0.0 or norm <= SIGNS_OF_LIFE * float(np.linalg.norm(full)):
             continue
-        # an effect that is not linear in its size is looked at where it has the size that was asked for
+        # an effect that is not linear in its size is evaluated at the requested size
         miss = 0.0 if weighted and columns else abs(float(np.log(max(rms, 1e-300) / size)))
         if best is None or miss < best[0]:
             best = (miss, v / norm, norm / rms)
@@ -173,7 +177,7 @@ def _response(on: Ground, place: Placed, size: float) -> Response | None:
 
 
 def _points(on: Ground, model: Model, begin: Array) -> list[Array]:
-    """Parameters of the placed effect at which it is looked at."""
+    """Return the parameters of the placed effect at which it is evaluated."""
     a, b = model.slices(0)
     out = list(starts(model, 0, on.problem.fit_view, begin))[:MOST_STARTS]
     middles = begin.copy()
@@ -194,15 +198,14 @@ def _points(on: Ground, model: Model, begin: Array) -> list[Array]:
 
 
 def _last(count: int) -> Array:
-    """Weights that take the last of so many columns."""
+    """Return weights that select the last of so many columns."""
     out = np.zeros(count)
     out[-1] = 1.0
     return out
 
 
 def _typical(left: Array, scales: list[float], searched: int) -> Array:
-    """Weights of the columns (first those of ``searched`` parameters, which count nothing) whose joint response is the
-    most visible one."""
+    """Return weights of the columns with the most visible joint response; ``searched`` first columns count nothing."""
     weights = np.zeros(left.shape[1])
     finite = [s if np.isfinite(s) and s > 0 else 1.0 for s in scales]
     weights[searched : searched + len(finite)] = finite[: max(0, left.shape[1] - searched)]

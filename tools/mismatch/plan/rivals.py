@@ -1,4 +1,4 @@
-"""From a report with equivalent effects to the rival models, each fitted to the recording of the report."""
+"""Builds rival models from a report with equivalent effects, each fitted to the recording of the report."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ MOST_PLACES = 3
 
 
 def noise_of(report: Mapping[str, Any]) -> dict[str, float]:
-    """The noise floors that a report states, by output."""
+    """Return the noise floors that a report states, by output."""
     fit = report.get("fit")
     floors = fit.get("noise_floor_rms", {}) if isinstance(fit, Mapping) else {}
     return {str(o): float(v) for o, v in floors.items() if isinstance(v, int | float) and v > 0}
 
 
 def groups_of(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The groups of effects that a report could not tell apart, each with a named one first."""
+    """Return the groups of effects that a report could not distinguish, each with a named one first."""
     named = [str(p["name"]) for p in report.get("physics", [])]
     out: list[tuple[str, ...]] = []
     for entry in report.get("equivalent", []):
@@ -46,9 +46,9 @@ def groups_of(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def rivals_of(
     where: Situation, report: Mapping[str, Any], group: tuple[str, ...], sigma: Mapping[str, float]
 ) -> list[Rival]:
-    """The named model and, for each other effect of ``group``, the model with that one in its place.
+    """Return the named model and, for each other effect of ``group``, the model with that one in its place.
 
-    InputError for a report of another recording or twin, or where the recording has no samples to fit rivals to.
+    Raises InputError for a report of another recording or twin, or if the recording has no samples to fit rivals to.
     """
     if not where.recorded:
         raise InputError(
@@ -88,7 +88,7 @@ def rivals_of(
 
 
 def best_rival(problem: Problem, rest: Model, full: Model, theta: Array, name: str) -> Rival | None:
-    """The effect ``name`` beside those of ``rest`` where it leaves least; None where it cannot be placed or fitted."""
+    """Place the effect ``name`` beside those of ``rest`` with the least residual; None if it cannot be fitted."""
     recording = problem.recording
     begin = rest.carry(full, theta, recording)
     best: tuple[float, Rival] | None = None
@@ -107,16 +107,16 @@ def best_rival(problem: Problem, rest: Model, full: Model, theta: Array, name: s
 
 
 def _same_twin(where: Situation, report: Mapping[str, Any]) -> None:
-    """InputError for a report of a twin with other parameters than this one was given."""
+    """Raise InputError for a report of a twin with other given parameters than this one."""
     fit = report["fit"]
-    said = {str(b["name"]): float(b["given"]) for b in fit.get("base_parameters", [])}
+    reported = {str(b["name"]): float(b["given"]) for b in fit.get("base_parameters", [])}
     twin = make(where.template)
     given = dict(zip((p.name for p in twin.parameters), twin.start(where.template).tolist(), strict=False))
-    if set(said) != set(given):
+    if set(reported) != set(given):
         return  # a circuit that the diagnosis opened, or a state space in other coordinates
     for name, value in given.items():
-        if abs(value - said[name]) > 1e-6 * max(abs(value), abs(said[name])) + 1e-12:
+        if abs(value - reported[name]) > 1e-6 * max(abs(value), abs(reported[name])) + 1e-12:
             raise InputError(
-                f"the report is of another twin than {where.path}: its {name} was {said[name]:g}, now {value:g}; "
+                f"the report is of another twin than {where.path}: its {name} was {reported[name]:g}, now {value:g}; "
                 "diagnose this recording again"
             )

@@ -1,4 +1,4 @@
-"""Finds the effects that a planned recording could tell apart, their sizes, and what would split the others."""
+"""Finds the effects that a planned recording could distinguish, their sizes, and what would split the others."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tools.mismatch.simulate_sites import why_not
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS
 
 THRESHOLD = 5.0
-"""Standard deviations of the noise that a response, or a difference of responses, must have."""
+"""Least size of a response, or of a difference of responses, in standard deviations of the noise."""
 DEFAULT_INPUT = "a random multisine"
 
 
 @dataclass(frozen=True)
 class Shown:
-    """``smallest_rms``: of the effect on its output, in noise rms, that would be seen beside a re-fit."""
+    """Holds the ``smallest_rms`` of an effect on its output, in noise rms, that is visible beside a re-fit."""
 
     name: str
     place: str
@@ -34,9 +34,11 @@ class Shown:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two effects. ``degrees``: the larger of the two angles between the response of one and what the other can do;
-    ``size``: the rms, in noise rms, from which one of them cannot pass for the other; ``sizes``: if the first, and if
-    the second is there.
+    """Compares two effects.
+
+    ``degrees`` is the larger of the two angles between the response of one and the span of the other; ``size`` is the
+    rms, in noise rms, from which one of them cannot imitate the other; ``sizes`` are those values if the first or if
+    the second effect is present.
     """
 
     names: tuple[str, str]
@@ -47,7 +49,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Splitter:
-    """Names what would split a pair: ``what`` in words; ``size`` with it, in noise rms (None: not simulated)."""
+    """Names the experiment that splits a pair: ``what`` in words; ``size`` with it, in noise rms (None: unknown)."""
 
     names: tuple[str, str]
     what: str
@@ -56,14 +58,16 @@ class Splitter:
 
 @dataclass(frozen=True)
 class Separable:
-    """``groups``: effects of which each is too close to the next; ``not_moved``: effects that this input does not
-    show; ``not_here``: those that these channels cannot have, with the reason.
+    """Holds the separable effects.
+
+    ``groups``: effects of which each is too close to the next; ``not_moved``: effects that this input does not excite;
+    ``not_here``: effects that these channels cannot have, with the reason.
     """
 
     input: str
     samples: int
     size: float
-    shown: tuple[Shown, ...]
+    visible: tuple[Shown, ...]
     pairs: tuple[Pair, ...]
     groups: tuple[tuple[str, ...], ...]
     splitters: tuple[Splitter, ...]
@@ -80,13 +84,13 @@ def pair_of(a: Response, b: Response) -> Pair:
 
 
 def _sine(a: Response, b: Response) -> float:
-    """Sine of the angle between the response of ``a`` and the nearest space of ``b``."""
+    """Return the sine of the angle between the response of ``a`` and the nearest space of ``b``."""
     inside = max((float(np.sum((space.T @ a.move) ** 2)) for space in b.tangents), default=0.0)
     return float(np.sqrt(max(0.0, 1.0 - inside)))
 
 
 def _strongest(found: Iterable[Response]) -> list[Response]:
-    """One response per effect: the place where it shows best."""
+    """Return a response per effect, at the place where it is strongest."""
     out: dict[str, Response] = {}
     for r in found:
         if r.effect.name not in out or r.norm_per_rms > out[r.effect.name].norm_per_rms:
@@ -95,7 +99,7 @@ def _strongest(found: Iterable[Response]) -> list[Response]:
 
 
 def groups_of(pairs: Sequence[Pair], size: float) -> tuple[tuple[str, ...], ...]:
-    """Effects that are joined by pairs that cannot be told apart at ``size``."""
+    """Return the groups of effects that are joined by pairs that cannot be distinguished at ``size``."""
     groups: list[set[str]] = []
     for p in pairs:
         if p.size <= size:
@@ -116,8 +120,10 @@ def separable(
     seed: int = 0,
     effects: Sequence[Effect] | None = None,
 ) -> Separable:
-    """Return what the channels of a situation could tell apart with the ``given`` inputs (or a random multisine), for
-    effects of ``size`` noise rms; for each pair that is too close, the input or channel that would split it.
+    """Return the effects of ``size`` noise rms that the channels of a situation could distinguish.
+
+    The input is ``given`` or a random multisine. For each pair that is too close, the result names the input or channel
+    that would split it.
     """
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     rng = np.random.default_rng([seed, 3])
@@ -149,7 +155,7 @@ def _splitters(
     where: Situation, limits: Mapping[str, Limits], sigma: Mapping[str, float], size: float, seed: int,
     close: Sequence[Pair],
 ) -> list[Splitter]:  # fmt: skip
-    """The described input that tells each close pair apart at the smallest size; else the experiment in words."""
+    """Return the described input that splits each close pair at the smallest size, else the experiment in words."""
     if not close:
         return []
     wanted = {n for p in close for n in p.names}
@@ -176,8 +182,9 @@ def _splitters(
 def channel_gains(
     where: Situation, limits: Mapping[str, Limits], sigma: Mapping[str, float], *, size: float, seed: int = 0
 ) -> dict[str, tuple[str, ...]]:
-    """For each context channel that is not recorded: the effects that could be named with it, and told from all
-    others that the recording then shows. The channel's course is a random slow one of its own.
+    """Return for each unrecorded context channel the effects that could be named with it.
+
+    They must be distinguishable from all others that the recording then shows. The channel's course is random and slow.
     """
     out: dict[str, tuple[str, ...]] = {}
     rng = np.random.default_rng([seed, 11])
@@ -203,7 +210,7 @@ def channel_gains(
 
 
 def with_context(course: Recording, signal: str, rng: np.random.Generator) -> Recording:
-    """The recording with a context channel that wanders slowly, one unit rms."""
+    """Return the recording with a context channel that wanders slowly, one unit rms."""
     x = np.cumsum(rng.standard_normal(course.n))
     x = (x - x.mean()) / max(float(x.std()), 1e-300)
     unit = CONTEXT_UNITS[signal][0]

@@ -10,7 +10,7 @@ from tools.mismatch.plan.separable import THRESHOLD
 
 
 def print_prospect(p: Prospect, say: Console) -> None:
-    """Tables of what shows and of what cannot be told apart."""
+    """Print tables of the visible effects and of those that cannot be distinguished."""
     rec = p.where.template
     output = next(iter(p.sigma))
     noise, unit = p.sigma[output], rec.unit[output]
@@ -24,7 +24,7 @@ def print_prospect(p: Prospect, say: Console) -> None:
     table = Table(title=f"smallest effect that shows ({THRESHOLD:g} sd)", title_justify="left", box=None)
     for heading in ("effect", "at", f"rms ({unit})"):
         table.add_column(heading, justify="right" if heading.startswith("rms") else "left")
-    for s in p.found.shown:
+    for s in p.found.visible:
         table.add_row(words((s.name,)), s.place, f"{s.smallest_rms * noise:.3g}")
     say.print(table)
     if not p.found.groups:
@@ -44,7 +44,7 @@ def print_prospect(p: Prospect, say: Console) -> None:
 
 
 def print_plan(d: Designed, say: Console) -> None:
-    """Return what is to be recorded and what it will separate."""
+    """Return the input to record and the effects that it will separate."""
     say.print(f"Equivalent so far: {words(d.group)}.", highlight=False, soft_wrap=True)
     say.print(f"Planned input: {d.plan.description} ({d.plan.evaluations} inputs tried).", highlight=False)
     for signal, box in d.plan.limits.items():

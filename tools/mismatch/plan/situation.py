@@ -1,4 +1,4 @@
-"""A twin with its channels and their rate, recorded or not: what the twin itself would give for an input."""
+"""Simulates a twin with its channels and rate, recorded or not, for a planned input."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ from tools.mismatch.twins.make import make
 from tools.mismatch.twins.opaque import OpaqueTwin
 
 PLACEHOLDERS = 64
-"""Samples of the made-up columns by which a description without data is checked."""
+"""Number of samples of the synthetic columns by which a description without data is checked."""
 
 STANDARD: dict[str, tuple[tuple[str, str, str, str], ...]] = {
     "piezo_stack": (("command_V", "input", "command", "V"), ("displacement_um", "output", "displacement", "um")),
 }
-"""Channels of a twin file that stands alone, where its kind leaves no choice: column, role, signal, unit."""
+"""Channels of a twin file without a recording, for kinds that leave no choice: column, role, signal, unit."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """A twin beside which something is to be recorded. ``template``: a recording with its channels, units and declared
-    noise; ``recorded`` says that its samples are measured and not made up.
+    """Describes a twin for which a recording is planned.
+
+    ``template`` is a recording with its channels, units and declared noise; ``recorded`` is True if its samples are
+    measured and not synthetic.
     """
 
     path: Path
@@ -44,7 +46,7 @@ class Situation:
         return self.template.dt
 
     def noise(self, output: str, floors: Mapping[str, float]) -> float:
-        """The rms noise of an output: declared, or ``floors``. InputError when nobody knows it."""
+        """Return the rms noise of an output: declared, or from ``floors``. Raises InputError if it is unknown."""
         found = self.template.noise.get(output) or floors.get(output)
         if not found:
             raise InputError(
@@ -53,9 +55,9 @@ class Situation:
         return float(found)
 
     def course(self, inputs: Mapping[str, Array]) -> Recording:
-        """A recording with these inputs (n,), the others at rest, and outputs that still have to be simulated.
+        """Return a recording with these inputs (n,), the others at rest, and outputs that are not simulated yet.
 
-        Until then they are a ramp: a record whose inputs and outputs repeat is taken to be in steady state, and this
+        The outputs are a ramp, because a record whose inputs and outputs repeat counts as one in steady state, and this
         one begins at rest.
         """
         n = next(iter(inputs.values())).size
@@ -73,8 +75,10 @@ class Situation:
 
 
 def situation(path: Path, noise: float | None = None, rate_hz: float | None = None) -> Situation:
-    """The situation that ``path`` describes: a recording, a ``recording.toml`` without ``data``, or a twin file of a
-    kind with standard channels. InputError or RecordingError says what is missing.
+    """Load the situation that ``path`` describes.
+
+    ``path`` is a recording, a ``recording.toml`` without ``data``, or a twin file of a kind with standard channels.
+    Raises InputError or RecordingError that says what is missing.
     """
     file = path / "recording.toml" if path.is_dir() else path
     text = descriptor(file)
@@ -119,7 +123,7 @@ def _without_data(file: Path, text: Mapping[str, Any]) -> Recording:
 
 
 def problem_of(recording: Recording, sigma: Mapping[str, float], seed: int = 0) -> Problem:
-    """A problem whose fit is the whole recording, at stated noise."""
+    """Return a problem whose fit is the whole recording, at stated noise."""
     twin, n = make(recording), recording.n
     if isinstance(twin, OpaqueTwin):
         raise InputError(
@@ -132,12 +136,12 @@ def problem_of(recording: Recording, sigma: Mapping[str, float], seed: int = 0) 
 
 
 def with_outputs(recording: Recording, outputs: Mapping[str, Array]) -> Recording:
-    """The recording with these outputs (n,)."""
+    """Return the recording with these outputs (n,)."""
     return replace(recording, outputs=dict(outputs))
 
 
 def simulated(recording: Recording, model: Model, theta: Array) -> dict[str, Array]:
-    """Outputs (n,) of a model over a whole recording; a twin with states begins at rest."""
+    """Return the outputs (n,) of a model over a whole recording; a twin with states begins at rest."""
     from tools.mismatch.simulate_view import View
 
     with np.errstate(all="ignore"):
@@ -145,5 +149,5 @@ def simulated(recording: Recording, model: Model, theta: Array) -> dict[str, Arr
 
 
 def noisy(outputs: Mapping[str, Array], sigma: Mapping[str, float], rng: np.random.Generator) -> dict[str, Array]:
-    """Outputs with independent normal noise."""
+    """Return the outputs with independent normal noise."""
     return {o: y + sigma[o] * rng.standard_normal(y.size) for o, y in outputs.items()}

@@ -1,4 +1,4 @@
-"""Structural analysis: which faults equations alone can tell apart, whatever their numbers.
+"""Analyses structure: the faults that equations alone can distinguish, independent of their numbers.
 
 Equations and unknowns form a bipartite graph; the overdetermined part of its decomposition (Dulmage and Mendelsohn
 1958) is what redundancy can test. A fault is detectable when its equation lies there, and isolable from another when it
@@ -21,14 +21,14 @@ from tools.mismatch.recording import Recording
 
 @dataclass(frozen=True)
 class Structure:
-    """``equations``: the unknowns of each equation; ``faults``: the equation that each fault enters."""
+    """Holds a structure: ``equations`` maps each equation to its unknowns, ``faults`` each fault to its equation."""
 
     equations: Mapping[str, frozenset[str]]
     faults: Mapping[str, str]
 
 
 def overdetermined(structure: Structure) -> set[str]:
-    """Equations of the overdetermined part: those that an alternating path joins to an unmatched equation."""
+    """Return the overdetermined part: the equations that an alternating path joins to an unmatched equation."""
     names = list(structure.equations)
     unknowns = sorted({u for us in structure.equations.values() for u in us})
     if not unknowns:
@@ -52,8 +52,9 @@ def overdetermined(structure: Structure) -> set[str]:
 
 
 def isolability(structure: Structure) -> NDArray[np.bool_]:
-    """(faults, faults): True where the fault of the row cannot be told from that of the column; a fault that cannot be
-    detected has a row of True.
+    """Return a matrix (faults, faults) that is True where the row's fault cannot be isolated from the column's.
+
+    A fault that cannot be detected has a row of True.
     """
     faults = list(structure.faults)
     out = np.ones((len(faults), len(faults)), np.bool_)
@@ -68,7 +69,7 @@ def isolability(structure: Structure) -> NDArray[np.bool_]:
 
 
 def groups(structure: Structure) -> list[tuple[str, ...]]:
-    """Faults that structure cannot tell from each other, each group once."""
+    """Return the groups of faults that structure cannot distinguish, each group once."""
     faults, same = list(structure.faults), isolability(structure)
     seen: set[str] = set()
     out: list[tuple[str, ...]] = []
@@ -82,7 +83,7 @@ def groups(structure: Structure) -> list[tuple[str, ...]]:
 
 
 def structure_of(recording: Recording) -> Structure:
-    """The structure of a recording's twin; a fault at each input, at each state and at each output.
+    """Return the structure of a recording's twin with a fault at each input, at each state and at each output.
 
     Twins without readable equations are one equation from all inputs to each output.
     """
@@ -152,7 +153,7 @@ def _add_matrices(
 
 
 def splitting_sensors(structure: Structure) -> dict[tuple[str, ...], tuple[str, ...]]:
-    """For each group of faults that structure cannot split: the unknowns which, measured as well, would split it."""
+    """Return for each group of faults that structure cannot split the unknowns whose measurement would split it."""
     unknowns = sorted({u for us in structure.equations.values() for u in us if not u.startswith("d ")})
     out: dict[tuple[str, ...], tuple[str, ...]] = {}
     for group in groups(structure):

@@ -1,4 +1,4 @@
-"""Families of inputs within limits: multisines, staircases, triangles, holds after steps, sweeps.
+"""Draws families of inputs within limits: multisines, staircases, triangles, holds after steps, sweeps.
 
 A waveform is a point ``z`` of a unit cube and a family; ``draw`` makes it obey the limits, so that a search needs none.
 """
@@ -17,14 +17,14 @@ SIZE = {"multisine": 18, "staircase": 13, "triangles": 10, "holds": 8, "sweep": 
 
 
 def draw(family: str, z: NDArray[np.float64], limits: Limits, dt: float) -> Array:
-    """The waveform (n,) of ``family`` at ``z``, in the input's unit."""
+    """Return the waveform (n,) of ``family`` at ``z``, in the input's unit."""
     n = max(2, round(limits.duration_s / dt))
     t = np.asarray(np.arange(n) * dt, np.float64)
     return limits.centre + _limited(_SHAPES[family](np.asarray(z, np.float64), t, limits), limits, dt)
 
 
 def _limited(shape: Array, limits: Limits, dt: float) -> Array:
-    """``shape`` (largest magnitude 1) scaled to the amplitude; what is too fast is slowed down, not scaled away."""
+    """Scale ``shape`` (largest magnitude 1) to the amplitude; parts that are too fast are slowed down, not reduced."""
     size = float(np.max(np.abs(shape)))
     x = shape * (limits.amplitude / size) if size > 0.0 else shape.copy()
     rms = float(np.sqrt(np.mean(x**2)))
@@ -41,7 +41,7 @@ def _limited(shape: Array, limits: Limits, dt: float) -> Array:
 
 
 def _between(z: float, low: float, high: float) -> float:
-    """Geometric between two positive numbers."""
+    """Interpolate geometrically between two positive numbers."""
     return float(low * (high / low) ** z)
 
 
@@ -65,7 +65,7 @@ def _triangle(phase: Array) -> Array:
 
 
 def _triangles(z: Array, t: Array, limits: Limits) -> Array:
-    """Two triangles one after the other, each with a rate, a size, a ramp of the size and an offset."""
+    """Return two successive triangles, each with a rate, a size, a ramp of the size and an offset."""
     cut = 0.2 + 0.6 * z[0]
     here = t / t[-1]
     out = np.zeros(t.size)
@@ -79,7 +79,7 @@ def _triangles(z: Array, t: Array, limits: Limits) -> Array:
 
 
 def _holds(z: Array, t: Array, limits: Limits) -> Array:
-    """Steps to levels that are held for unlike times."""
+    """Return steps to levels that are held for different times."""
     count = z.size // 2
     share = 0.05 + z[:count] ** 2
     edges = np.concatenate([[0.0], np.cumsum(share / share.sum())]) * t[-1]
@@ -96,7 +96,7 @@ def _sweep(z: Array, t: Array, limits: Limits) -> Array:
 
 
 def _mixed(z: Array, t: Array, limits: Limits) -> Array:
-    """A staircase with a triangle on it: fast small loops at many levels."""
+    """Return a staircase plus a triangle: fast small loops at many levels."""
     size = 0.05 + 0.6 * z[0]
     stairs = _staircase(z[2:], t, limits)
     return (1.0 - size) * stairs + size * _triangle(_between(z[1], *limits.band_hz) * t)
@@ -113,8 +113,10 @@ _SHAPES = {
 
 
 def random_multisine(rng: np.random.Generator, limits: Limits, dt: float, energy: float | None = None) -> Array:
-    """A multisine of random frequencies and phases in the band. With ``energy`` (mean square about the centre) it has
-    just that, whatever peak and rate this gives: the comparison is in its favour.
+    """Return a multisine of random frequencies and phases in the band.
+
+    With ``energy`` (mean square about the centre) it has exactly that energy without limits of peak and rate; a
+    comparison with a planned input is then in its favour.
     """
     if energy is None:
         return draw("multisine", rng.random(SIZE["multisine"]), limits, dt)
@@ -126,7 +128,7 @@ def random_multisine(rng: np.random.Generator, limits: Limits, dt: float, energy
 
 
 def mean_square(x: Array, limits: Limits) -> float:
-    """Energy of an input: its mean square about the centre."""
+    """Return the energy of an input: its mean square about the centre."""
     return float(np.mean((x - limits.centre) ** 2))
 
 
@@ -141,4 +143,4 @@ LIBRARY: dict[str, tuple[str, tuple[float, ...]]] = {
         (0.3, 0.8, 0.6, *(0.5 + 0.5 * np.sin(3.1 * np.arange(13))).tolist()),
     ),
 }
-"""Inputs that a person can describe, by the words that describe them."""
+"""Inputs that a person can describe, by their descriptions."""

@@ -1,4 +1,4 @@
-"""A plan as files: csv, npz, a program of the bench, and a picture."""
+"""Writes a plan to files: csv, npz, a program of the bench, and a picture."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tools.output import save_figure, write_bytes_atomic, write_text_atomic
 
 CSV, NPZ, PROGRAM, PICTURE = "input.csv", "input.npz", "program.toml", "plan.png"
 PROGRAM_RATE_HZ = 1000.0
-"""Rate of a program of the bench: its tick. A plan at another rate is interpolated linearly."""
+"""Rate of a program of the bench, which is its tick rate. A plan at another rate is interpolated linearly."""
 
 
 def columns(plan: Plan, where: Situation) -> dict[str, Array]:
-    """Time and inputs in the units and under the names of the data file."""
+    """Return time and inputs in the units and under the names of the data file."""
     rec = where.template
     n = next(iter(plan.waves.values())).size
     out: dict[str, Array] = {"t_s": np.asarray(np.arange(n) * plan.dt, np.float64)}
@@ -52,7 +52,7 @@ def write_plan(plan: Plan, where: Situation, folder: Path, stacks: Sequence[int]
 
 
 def program(plan: Plan, stacks: Sequence[int]) -> str:
-    """The first input as a program for ``micron run --manual``: volts of ``stacks`` (1 to 3), tick by tick."""
+    """Write the first input as a program for ``micron run --manual``: volts of ``stacks`` (1 to 3), tick by tick."""
     wave = next(iter(plan.waves.values()))
     n = round(wave.size * plan.dt * PROGRAM_RATE_HZ)
     volts = np.interp(np.arange(n) / PROGRAM_RATE_HZ, np.arange(wave.size) * plan.dt, wave)
@@ -66,7 +66,7 @@ def program(plan: Plan, stacks: Sequence[int]) -> str:
 
 
 def draw_plan(plan: Plan, where: Situation, rivals: Sequence[Rival], sigma: dict[str, float], path: Path) -> None:
-    """The planned inputs, and what each rival leaves of the named model on them after a re-fit, in noise rms."""
+    """Draw the planned inputs, and the difference of each re-fitted rival from the named model, in noise rms."""
     from matplotlib.figure import Figure
 
     course = where.course(plan.waves)
