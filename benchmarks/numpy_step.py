@@ -73,7 +73,7 @@ class NumpyStep:
         s.motion[:] = kin.solve @ (readings - centripetal)
         self.attitude(self.point_force(p.quiet_point, w), s.motion[3:], f[AT["magnetometer"]], fresh)
         s.last_tick = f[AT["tick"]]
-        corrected, dt = att.error_state.corrected, p.attitude.dt_s
+        corrected, dt = att.corrected, p.attitude.dt_s
         sudden = (corrected[0] - s.turned) / dt**2 + corrected[1] / dt - corrected[2]
         s.turned[:] = corrected[0]
         up = att.matrix[2] + np.cross(biquads(sudden, s.lean, p.lean_sections), att.matrix[2])
@@ -137,9 +137,9 @@ class NumpyStep:
             e.field_fresh_s = 0.0
         back = c.T @ x[:3]
         self.turn(back)
-        e.corrected[0] = back
-        e.corrected[1] = x[RATE : RATE + 3]
-        e.corrected[2] += x[BIAS : BIAS + 3]
+        att.corrected[0] = back
+        att.corrected[1] = x[RATE : RATE + 3]
+        att.corrected[2] += x[BIAS : BIAS + 3]
         att.rate += x[RATE : RATE + 3]
         att.bias += x[BIAS : BIAS + 3]
         e.velocity += x[VELOCITY : VELOCITY + 3]

@@ -15,18 +15,7 @@ from numpy.typing import NDArray
 from drivers.daq.di4108_kernels import READY, WAIT, accept, decode, new_stream
 from drivers.piezo.e727_kernels import TEXT_BYTES, encode
 from firmware_py.control.chain import COMMANDED, step_kernel
-from firmware_py.control.plausibility import (
-    NO_SLOPE,
-    PAIR_PLACES,
-    PAIRS,
-    SENSORS,
-    SPREAD_S,
-    TICK_S,
-    TOGETHER_V,
-    PlausibilityLimits,
-    check_counts,
-    check_pairs,
-)
+from firmware_py.control.plausibility import CheckMemory, PlausibilityLimits, ScanCheck, check_frame, check_scan
 from firmware_py.control.stages import Stages
 from firmware_py.frame import COMMAND, COUNTS, MAGNETOMETER_FRESH, STATUS, TICK, TIME
 from hal.compiled import kernel, thread_kernel
@@ -42,25 +31,6 @@ ENDED, FAILED, IMPLAUSIBLE, BAD_STREAM = 0, 1, 2, 3
 implausible; bytes are missing or the device has stopped itself."""
 
 
-class Checks(NamedTuple):
-    """State and limits of the plausibility checks, as ``ScanCheck`` holds them."""
-
-    last: NDArray[np.int64]
-    same: NDArray[np.int64]
-    slope: NDArray[np.int64]
-    odd: NDArray[np.int64]
-    together: NDArray[np.int64]
-    limits: NDArray[np.int64]
-    window: NDArray[np.float64]
-    sums: NDArray[np.float64]
-    usual: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    pair_step: NDArray[np.float64]
-    mix: NDArray[np.float64]
-    pair_limits: NDArray[np.float64]
-    places: NDArray[np.int64]
-
-
 class Buffers(NamedTuple):
     """Memory of ``serve``: bytes that were read, scans, the text of a command."""
 
@@ -69,18 +39,9 @@ class Buffers(NamedTuple):
     text: NDArray[np.uint8]
 
 
-def new_checks(lsb_V: float) -> Checks:
+def new_checks(lsb_V: float) -> CheckMemory:
     """Return the default limits, before the first scan."""
-    limits = PlausibilityLimits()
-    volts = (limits.jump_V, limits.outlier_V, limits.supply_step_V, *limits.rail_V)
-    return Checks(
-        np.zeros(CHANNELS, np.int64), np.full(CHANNELS, -1), np.full(CHANNELS, NO_SLOPE), np.zeros(CHANNELS, np.int64),
-        np.array([NO_SLOPE, round(TOGETHER_V / lsb_V)]),
-        np.array([*(round(v / lsb_V) for v in volts), limits.stuck_ticks]),
-        np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3)),
-        np.array(limits.pair_step_m_s2), np.eye(len(PAIRS)),
-        np.array([limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S]), PAIR_PLACES,
-    )  # fmt: skip
+    return ScanCheck(PlausibilityLimits(), lsb_V, range(CHANNELS), [""] * CHANNELS).memory
 
 
 def new_buffers() -> Buffers:
@@ -88,7 +49,7 @@ def new_buffers() -> Buffers:
 
 
 @kernel
-def tick(memory: Record, scan: NDArray[np.int16], k: int, newest: bool, checks: Checks) -> bool:
+def tick(memory: Record, scan: NDArray[np.int16], k: int, newest: bool, checks: CheckMemory) -> bool:
     """Check the scan, run the step, check its pairs, as the loop's tasks sense and estimate do. Return True if both
     checks passed. ``newest``: the step computes a command."""
     frame = memory[0].frame
@@ -96,22 +57,15 @@ def tick(memory: Record, scan: NDArray[np.int16], k: int, newest: bool, checks: 
     frame[MAGNETOMETER_FRESH] = 1.0 if k % FIELD_TICKS == 0 else 0.0
     for i in range(CHANNELS):
         frame[COUNTS + i] = scan[i]
-    c, limits = checks, checks.limits
-    if check_counts(
-        scan, SENSORS, c.last, c.same, c.slope, c.odd, c.together, 1, limits[0], limits[1], limits[2], limits[3],
-        limits[4], limits[5],
-    ):  # fmt: skip
+    if check_scan(scan, k, checks):
         return False
     step_kernel(memory)
-    return check_pairs(
-        frame, c.places, c.mix, k, c.window, c.sums, c.usual, c.spread, c.pair_step, c.pair_limits[0], c.pair_limits[1],
-        c.pair_limits[2],
-    ) <= 0  # fmt: skip
+    return check_frame(frame, checks) <= 0
 
 
 @thread_kernel
 def serve(
-    scans_fd: int, commands_fd: int, ticks: int, memory: Record, stream: Record, checks: Checks, buffers: Buffers
+    scans_fd: int, commands_fd: int, ticks: int, memory: Record, stream: Record, checks: CheckMemory, buffers: Buffers
 ) -> int:
     """Answer ``ticks`` scans of the DI-4108 on ``scans_fd`` with an E-727's commands on ``commands_fd``, one for the
     newest scan of each read. Return why it ended."""

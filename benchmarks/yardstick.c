@@ -255,10 +255,10 @@ static int attitude(Attitude *s, const sense_params_attitude *p, const double *f
     double tz = c[0][2] * x[0] + c[1][2] * x[1] + c[2][2] * x[2];
     rotate_by(s->quaternion, tx, ty, tz);
     to_matrix(s->quaternion, c);
-    e->corrected[0][0] = tx, e->corrected[0][1] = ty, e->corrected[0][2] = tz;
+    s->corrected[0][0] = tx, s->corrected[0][1] = ty, s->corrected[0][2] = tz;
     for (int i = 0; i < 3; i++) {
-        e->corrected[1][i] = x[RATE_ + i];
-        e->corrected[2][i] += x[BIAS + i];
+        s->corrected[1][i] = x[RATE_ + i];
+        s->corrected[2][i] += x[BIAS + i];
         s->rate[i] += x[RATE_ + i];
         s->bias[i] += x[BIAS + i];
         e->velocity[i] += x[VELOCITY + i];
@@ -286,7 +286,7 @@ static int sense(double *f, sense_state *s, const sense_params *p)
     int bits = 0;
     Attitude *a = &s->attitude;
     if (calibrate(f, s->smoothed, &p->calibration, &bits)) return 1;
-    if (f[TICK] - s->last_tick != 1.0 || !a->aligned || p->attitude.method != 1) return 1;
+    if (f[TICK] - s->last_tick != 1.0 || !a->aligned) return 1;
     s->last_tick = f[TICK];
     int fresh = f[MAGNETOMETER_FRESH] != 0.0;
     if (fresh)
@@ -301,7 +301,7 @@ static int sense(double *f, sense_state *s, const sense_params *p)
     point_force(s->motion, a->bias, a->rate, p->quiet_point, felt);
     if (attitude(a, &p->attitude, felt, s->motion + 3, f + MAGNETOMETER, fresh)) return 1;
     double sudden[3], turn[3], dt = p->attitude.dt_s;
-    double(*corrected)[3] = a->error_state.corrected;
+    double(*corrected)[3] = a->corrected;
     for (int i = 0; i < 3; i++) {
         sudden[i] = (corrected[0][i] - s->turned[i]) / (dt * dt) + corrected[1][i] / dt - corrected[2][i];
         s->turned[i] = corrected[0][i];
@@ -501,7 +501,7 @@ static void combine(double sample, estimate_state_combiner *s, const estimate_pa
 
 static int estimate(double *f, estimate_state *s, const estimate_params *p)
 {
-    if (p->family != 0 || f[TICK] - s->last_tick != 1.0) return 1;
+    if (f[TICK] - s->last_tick != 1.0) return 1;
     Adaptive *a = &s->adaptive;
     const Filter *q = &p->adaptive;
     s->last_tick = f[TICK];

@@ -115,7 +115,9 @@ def _rates(each: int, tick_hz: int, gap: int, most: int) -> Iterator[float]:
                 yield rate_hz
 
 
-def _refusal(name: str, rate_hz: float, each: int, tick_hz: int, gap: int, what: str, most: int = MOST_IN_FRAME) -> str:
+def _refusal(
+    name: str, rate_hz: float, each: int, tick_hz: int, gap: int, what: str, *, most: int = MOST_IN_FRAME
+) -> str:
     rates = set(_rates(each, tick_hz, gap, most))
     below = max((rate for rate in rates if rate < rate_hz), default=None)
     above = min((rate for rate in rates if rate > rate_hz), default=None)

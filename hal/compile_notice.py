@@ -53,7 +53,5 @@ class CompileNotice(event.Listener):
         if spent_s < self._next_s:
             return
         self._next_s = spent_s + REPEAT_S
-        sys.stderr.write(
-            f"compiling kernels, once per version here, one to three minutes: {self._done} done, {spent_s:.0f} s\n"
-        )
+        sys.stderr.write(f"compiling kernels, once per version on this machine: {self._done} done, {spent_s:.0f} s\n")
         sys.stderr.flush()

@@ -21,9 +21,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from hal.bench import BenchFile
 from hal.children import child_command, child_environment
 
-WAVES: tuple[tuple[str, ...], ...] = (("sensing", "motion"), ("step",))
-"""Parts that are compiled beside each other. The step calls all others and is compiled last."""
-EXPECTED: Mapping[str, int] = {"sensing": 147, "motion": 143, "step": 4}
+WAVES: tuple[tuple[str, ...], ...] = (("instrument", "tremor"), ("step",))
+"""Parts that are compiled beside each other. The step needs the others' stages and is compiled last."""
+EXPECTED: Mapping[str, int] = {"instrument": 79, "tremor": 64, "step": 7}
 """Kernels that numba compiles for each part: the scale of the progress bar and nothing else."""
 
 
@@ -97,11 +97,11 @@ def compile_part(part: str, bench: BenchFile, method: str | None) -> None:
 
     configs = load_plan(bench, method).stages
     stages = Stages(configs)
-    if part == "sensing":
-        stages.warm_up_sensing()
+    if part == "instrument":
+        stages.warm_up_parts("sense", "actuate")
         _compile_drivers({device.driver for device in bench.description.device.values()})
-    elif part == "motion":
-        stages.warm_up_motion()
+    elif part == "tremor":
+        stages.warm_up_parts("estimate", "detect")
         if bench.description.emulated_buses():
             _compile_plant(bench)
     else:

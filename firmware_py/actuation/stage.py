@@ -21,7 +21,7 @@ from firmware_py.actuation.hysteresis import (
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip, tip_from_strokes
 from firmware_py.actuation.reach import inside, nearest_reachable
-from firmware_py.actuation.yielding import YIELD_STATE, shrink_core, yield_rest
+from firmware_py.actuation.yielding import Swing, YieldLimits, YieldState, shrink_core, yield_rest
 from firmware_py.frame import (
     ALIGNING,
     CLIP,
@@ -39,7 +39,7 @@ from firmware_py.frame import (
     TREMOR_AHEAD,
     TREMOR_CORE,
 )
-from firmware_py.records import Record, attributes, copy_record, new_record
+from firmware_py.records import Record, attributes, copy_record, dtype_of, new_record
 from hal.compiled import kernel
 from hal.scratch import scratch
 
@@ -84,7 +84,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
         [
             ("on", "f8", (3,)),  # 0 .. 1, how far compensation of each axis is switched on
             ("tilt", "f8", (2,)),  # of the shaft, where the next inverse kinematics starts
-            ("yielding", YIELD_STATE),
+            ("yielding", dtype_of(YieldState)),
             ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
             ("target", "f8", (3,)),  # stroke from neutral that was asked of the stack, m
             ("rest", "f8", (3,)),  # what hysteresis had left of the stroke when a hold ended, m; fades
@@ -165,23 +165,21 @@ def actuate_state(config: ActuationConfig, params: Record) -> Record:
 
 
 @kernel
-def command_stack(
-    target: float, plays: Array, creep: Array, slopes: Array, last_target: float, last_V: float, i: int, param: Record
-) -> tuple[float, int]:
+def command_stack(target: float, i: int, state: Record, param: Record) -> tuple[float, int]:
     """Return the limited drive V of stack ``i`` for the stroke ``target`` (m from neutral), and the Clip bits of the
     limits that acted.
 
-    Moves ``plays`` and ``creep`` by what is commanded, so that after a limit the model still knows the stack.
+    Moves the model's plays and creep by what is commanded, so that after a limit it still knows the stack.
     """
-    stack = param.stacks[i]
+    stack, plays, creep, slopes = param.stacks[i], state.plays[i], state.creep[i], state.slopes
     clip = 0
-    if slopes_at(abs(target - last_target) * param.tick_hz, stack, slopes):
+    if slopes_at(abs(target - state.target[i]) * param.tick_hz, stack, slopes):
         clip |= CLIP_SINGULAR
     wanted = drive(param.neutral_stroke[i] + target, slopes, plays, creep, stack)
     inside_V = limit_voltage(wanted, param.low_V, param.high_V)
     if inside_V != wanted:
         clip |= CLIP_VOLTAGE
-    command = limit_slew(inside_V, last_V, param.slew_step_V)
+    command = limit_slew(inside_V, state.command_V[i], param.slew_step_V)
     if command != inside_V:
         clip |= CLIP_SLEW
     stack_stroke(command, slopes, plays, creep, stack)
@@ -218,9 +216,10 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     clip = 0
     strokes_from_tip(tip, param.geometry, state.tilt, stroke)
     strokes_from_tip(core_tip, param.geometry, state.yielding.tilt, core_stroke)
-    low, high, keep = param.swing_low, param.swing_high, param.yield_keep
-    shrunk = shrink_core(stroke, core_stroke, low, high, param.overdrive, param.tilts, keep, state.yielding)
-    if yield_rest(stroke, core_stroke, low, high, keep, state.yielding) or shrunk:
+    low, high = param.swing_low, param.swing_high
+    swing, limits = Swing(stroke, core_stroke), YieldLimits(low, high, param.yield_keep, param.overdrive, param.tilts)
+    shrunk = shrink_core(swing, state.yielding, limits)
+    if yield_rest(swing, state.yielding, limits) or shrunk:
         clip |= CLIP_YIELD
         tip_from_strokes(stroke, param.geometry, tip)
     if not inside(stroke, low, high):
@@ -242,9 +241,7 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
             target += param.taps[i, k] * past[k]
         target += state.rest[i]
         state.rest[i] *= param.rest_keep
-        command, limited = command_stack(
-            target, state.plays[i], state.creep[i], state.slopes, state.target[i], state.command_V[i], i, param
-        )
+        command, limited = command_stack(target, i, state, param)
         clip |= limited
         state.target[i] = target
         state.command_V[i] = command

@@ -12,45 +12,65 @@ swing is kept within ``overdrive`` strokes, by a scale that follows the swing an
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
-from firmware_py.records import Record
+import numpy as np
+
+from firmware_py.records import Array, field, record
 from hal.compiled import kernel
 from hal.scratch import scratch
 
-Array = NDArray[np.float64]
 
-YIELD_STATE = np.dtype(
-    [
-        ("tilt", "f8", (2,)),  # of the shaft under the core alone, where the next inverse kinematics starts
-        ("core_last", "f8", (3,)),  # m of stroke, a tick ago
-        ("core_power", "f8"),  # m^2, recent mean square of the core
-        ("core_change", "f8"),  # m^2, that of its change in a tick
-        ("core_over", "f8"),  # recent peak of the core's swing over what is let through
-        ("tilt_over", "f8"),  # the same of the swing's tilt
-        ("core_peak", "f8", (3,)),  # m of stroke
-        ("side_peak", "f8", (3,)),  # m of stroke, as let through
-        ("side_over", "f8"),  # recent peak of the tilting rest over its room
-        ("axial_over", "f8"),
-    ]
-)
+class Swing(NamedTuple):
+    """Strokes from neutral (3,), m: those of all that is wanted, and of the core alone."""
+
+    stroke: Array
+    core: Array
+
+
+class YieldLimits(NamedTuple):
+    """Ends of the strokes (3,), m from neutral; what is kept of a peak per tick; ``ActuationConfig.overdrive`` and
+    ``overdrive_tilts``."""
+
+    low: Array
+    high: Array
+    keep: float
+    overdrive: float
+    tilts: int
+
+
+@record
+class YieldState:
+    """Recent peaks and powers of the core and of the rest."""
+
+    tilt: Array = field("rad", 2)  # of the shaft under the core alone, where the next inverse kinematics starts
+    core_last: Array = field("m", 3)  # of stroke, a tick ago
+    core_power: float = field("m^2")  # recent mean square of the core
+    core_change: float = field("m^2")  # that of its change in a tick
+    core_over: float = field("1")  # recent peak of the core's swing over what is let through
+    tilt_over: float = field("1")  # the same of the swing's tilt
+    core_peak: Array = field("m", 3)  # of stroke
+    side_peak: Array = field("m", 3)  # of stroke, as let through
+    side_over: float = field("1")  # recent peak of the tilting rest over its room
+    axial_over: float = field("1")
+
+
 LEAST_SHRINK = 1e-4  # of the swing: less is nothing
 LEAST_ROOM = 0.1  # of a stroke's half range whatever the core takes, of that room whatever tilts the shaft
 
 
 @kernel
-def shrink_core(
-    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, tilts: int, keep: float, state: Record
-) -> bool:
-    """Shrink the swing of ``core`` (3,) m to ``overdrive`` times the stroke at most, and ``stroke`` (3,) by as much.
-    Return True if anything was shrunk.
+def shrink_core(swing: Swing, state: YieldState, limits: YieldLimits) -> bool:
+    """Shrink the core of ``swing`` to ``overdrive`` times the stroke at most, and its stroke by as much. Return True if
+    anything was shrunk.
 
     A swing is x and its quadrature: the change in a tick over the angle that the core turns in a tick (the root of the
     ratio of their mean squares, remembered by ``keep`` per tick). The scale falls at once and recovers within half a
     turn. With ``tilts`` the tilt is shrunk first, as far as it is beyond the limit by itself; the swing along the shaft
     gets what the tilt leaves of each stroke, added as phasors. ``overdrive`` 0 shrinks nothing.
     """
+    stroke, core = swing
+    low, high, keep, overdrive, tilts = limits
     mean = turned = power = change = 0.0
     for i in range(3):
         if not (np.isfinite(stroke[i]) and np.isfinite(core[i])):
@@ -69,10 +89,10 @@ def shrink_core(
     if tilts != 0 and overdrive > 0.0:
         for i in range(3):
             side, across = core[i] - mean, ticks * (core[i] - state.core_last[i]) - turned
-            swing = np.sqrt(side * side + across * across)
+            size = np.sqrt(side * side + across * across)
             most = overdrive * min(high[i], -low[i])
-            if swing > most:
-                tilt = min(tilt, most / swing)
+            if size > most:
+                tilt = min(tilt, most / size)
         state.tilt_over = _remembered(state.tilt_over, tilt, forget)
         tilt = 1.0 / state.tilt_over
     along = mean * mean + turned * turned
@@ -106,12 +126,11 @@ def _remembered(over: float, share: float, forget: float) -> float:
 
 
 @kernel
-def yield_rest(stroke: Array, core: Array, low: Array, high: Array, keep: float, state: Record) -> bool:
-    """Replace ``stroke`` (3,) m by ``core`` (3,) plus the share of the rest that is let through. Return True if
-    anything was held back.
-
-    ``low``, ``high`` (3,): ends of the strokes from neutral; ``keep``: what is kept of a peak per tick.
-    """
+def yield_rest(swing: Swing, state: YieldState, limits: YieldLimits) -> bool:
+    """Replace the stroke of ``swing`` by its core plus the share of the rest that is let through. Return True if
+    anything was held back."""
+    stroke, core = swing
+    low, high, keep = limits.low, limits.high, limits.keep
     mean = 0.0
     for i in range(3):
         if not (np.isfinite(stroke[i]) and np.isfinite(core[i])):

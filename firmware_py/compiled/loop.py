@@ -128,7 +128,7 @@ class CompiledMicron(Micron):
         field = self._field
         volts, fresh = (field.volts, field.fresh) if field is not None else (np.zeros(3), np.zeros(1, np.int64))
         check = self._check.memory
-        saved = np.zeros(4 * len(check.last) + len(check.together) + 1, np.int64)
+        saved = np.zeros(4 * check.state["last"].size + 2, np.int64)
         return Memory(
             words, self.stages.memory, stream, buffer, self.scans.rows, check, saved, volts, fresh,
             self._output.memory(words[at.FIXED_NS : at.FIXED_NS + 1]), self._timing(), self._sinks(),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from firmware_py.control.plausibility import CheckMemory
 
 Words = NDArray[np.int64]
 
@@ -85,7 +88,7 @@ class Sinks(NamedTuple):
 
 class Memory(NamedTuple):
     """Holds everything that the thread works on. ``step``: ``Stages.memory``; ``stream`` and ``buffer``: the DAQ's;
-    ``rows``: scans of the block under way; ``check``: of ``ScanCheck``; ``saved``: room for its state; ``field`` and
+    ``rows``: scans of the block; ``check``: that of ``ScanCheck``; ``saved``: room for its state; ``field`` and
     ``fresh``: of ``FieldInput``; ``output``: of the output's driver; ``notes`` (NOTE_ROOM, 2): warning bits that rose,
     and their ticks."""
 
@@ -94,7 +97,7 @@ class Memory(NamedTuple):
     stream: Any
     buffer: NDArray[np.uint8]
     rows: NDArray[np.int16]
-    check: Any
+    check: CheckMemory
     saved: NDArray[np.int64]
     field: NDArray[np.float64]
     fresh: Words

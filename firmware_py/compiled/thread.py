@@ -8,8 +8,6 @@ Importing this module imports numba. It imports little else, because a change of
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,8 +96,7 @@ from firmware_py.compiled.memory import (
 from firmware_py.compiled.outputs import is_stuck, step_ramp, verify, write
 from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.control.fresh_field import fill_field
-from firmware_py.control.plausibility import TICK as CHECK_TICK
-from firmware_py.control.plausibility import check_frame, check_scan
+from firmware_py.control.plausibility import CheckState, check_frame, check_scan
 from firmware_py.frame import CLIP, CLIP_YIELD, COMMAND, COUNTS, DRIFT, INVALID, JERK, STALE, STATUS, TICK, TIME
 from firmware_py.live.memory import announce, put_over
 from firmware_py.recording.ring import announce_row, put_row
@@ -137,10 +134,10 @@ def clock_ns(words: Words) -> int:
 
 
 @kernel
-def save(check: Any, saved: Words, back: bool) -> None:
+def save(check: CheckState, saved: Words, back: bool) -> None:
     """Copy the state that ``check_scan`` changes to ``saved``, or back."""
     at = 0
-    for part in (check.last, check.same, check.slope, check.odd, check.together):
+    for part in (check.last, check.same, check.slope, check.odd):
         for i in range(len(part)):
             if back:
                 part[i] = saved[at]
@@ -148,9 +145,9 @@ def save(check: Any, saved: Words, back: bool) -> None:
                 saved[at] = part[i]
             at += 1
     if back:
-        check.words[CHECK_TICK] = saved[at]
+        check.tick, check.together = saved[at], saved[at + 1]
     else:
-        saved[at] = check.words[CHECK_TICK]
+        saved[at], saved[at + 1] = check.tick, check.together
 
 
 @kernel
@@ -163,9 +160,9 @@ def sense(m: Memory, frame: NDArray[np.float64], row: int, k: int, due_ns: int) 
     frame[STATUS] = 0
     for i in range(len(scan)):
         frame[COUNTS + i] = scan[i]
-    save(m.check, m.saved, False)
-    if check_scan(m.check, scan, k) != 0:
-        save(m.check, m.saved, True)
+    save(m.check.state[0], m.saved, False)
+    if check_scan(scan, k, m.check) != 0:
+        save(m.check.state[0], m.saved, True)
         return False
     fill(frame, m.field, m.fresh)
     return True
@@ -181,7 +178,7 @@ def estimate(m: Memory, frame: NDArray[np.float64], k: int, newest: bool) -> int
     step_kernel(m.step)
     bits = int(frame[STATUS])
     if bits & (INVALID | STALE) == 0:
-        found = check_frame(m.check, frame)
+        found = check_frame(frame, m.check)
         if found > 0:
             return found
         if found < 0:

@@ -1,7 +1,8 @@
 """The step of the instrument: sense, estimate, actuate as one compiled call over one frame.
 
 The live loop calls ``step_kernel`` once a tick; replay and batches loop the same kernel inside compiled code
-(``run_kernel``). There is no second implementation, so the three give the same numbers bit for bit.
+(``run_kernel``). There is no second implementation, so the three give the same numbers bit for bit. The step calls each
+stage at an address in its memory: the stages are compiled by themselves, and no caller of the step compiles them again.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from firmware_py.sensing.stage import sense_kernel
 from firmware_py.tremor.detectors import detect_kernel
 from firmware_py.tremor.stage import estimate_kernel
 from hal.compiled import kernel
+from hal.kernel_calls import call_entry, entry
 
 COMMANDED = int(FrameStatus.COMMANDED)
 MANUAL = int(FrameStatus.MANUAL)
@@ -30,16 +32,18 @@ GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE) | COMMANDED | MANUAL | HEL
 
 
 PARTS = ("sense", "estimate", "detect", "actuate")
+KERNELS = (sense_kernel, estimate_kernel, detect_kernel, actuate_kernel)
 
 
 def memory_dtype(parts: Sequence[tuple[np.dtype[Any], np.dtype[Any]]]) -> np.dtype[Any]:
-    """The frame and each stage's ``NAME_state`` and ``NAME_params``, given as dtypes in the order of ``PARTS``.
+    """The frame and each stage's ``NAME_state``, ``NAME_params`` and ``NAME_entry`` (the address of its code, see
+    ``bind``). States and parameters are given as dtypes in the order of ``PARTS``.
 
     One record for all, because each array that Python hands to a compiled kernel costs about 0.35 us a call.
     """
     fields: list[Any] = [("frame", "f8", (LAYOUT.size,))]
     for name, (state, params) in zip(PARTS, parts, strict=True):
-        fields += [(f"{name}_state", state, (1,)), (f"{name}_params", params, (1,))]
+        fields += [(f"{name}_state", state, (1,)), (f"{name}_params", params, (1,)), (f"{name}_entry", "i8")]
     return _the_one(np.dtype(fields))
 
 
@@ -50,6 +54,13 @@ def _the_one(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return dtype
 
 
+def bind(memory: Record) -> None:
+    """Compile or load the stages' kernels and write their addresses to ``memory``. A step needs them."""
+    m = memory[0]
+    for name, stage in zip(PARTS, KERNELS, strict=True):
+        m[f"{name}_entry"] = entry(stage, m["frame"], m[f"{name}_state"], m[f"{name}_params"])
+
+
 @kernel
 def step_kernel(memory: Record) -> None:
     """Compute one tick: the frame's columns left of the volts and the ``GIVEN_BITS`` of its status are the input.
@@ -57,16 +68,18 @@ def step_kernel(memory: Record) -> None:
     COMMANDED: a command is computed. MANUAL: ``command`` is given and the actuation stage follows it. HELD: the same,
     and compensation begins where the outputs are then. None: the outputs are not free to move, or a newer scan is there
     already; the last command stays in its column.
-    ``memory`` (1,) is of ``memory_dtype``.
+    ``memory`` (1,) is of ``memory_dtype`` and bound.
     """
     m = memory[0]
     frame = m.frame
-    sense_kernel(frame, m.sense_state, m.sense_params)
-    estimate_kernel(frame, m.estimate_state, m.estimate_params)
-    detect_kernel(frame, m.detect_state, m.detect_params)
+    if m.sense_entry == 0:
+        raise RuntimeError("the memory is not bound")
+    call_entry(m.sense_entry, frame, m.sense_state, m.sense_params)
+    call_entry(m.estimate_entry, frame, m.estimate_state, m.estimate_params)
+    call_entry(m.detect_entry, frame, m.detect_state, m.detect_params)
     status = int(frame[STATUS])
     if status & COMMANDED:
-        actuate_kernel(frame, m.actuate_state, m.actuate_params)
+        call_entry(m.actuate_entry, frame, m.actuate_state, m.actuate_params)
     elif status & (MANUAL | HELD):
         follow_kernel(frame, m.actuate_state, m.actuate_params)
         if status & HELD:

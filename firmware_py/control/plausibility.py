@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from firmware_py.frame import ACCELEROMETER, LAYOUT
+from firmware_py.records import Array, Integers, Records, attributes, field, new, record
 from hal.compiled import kernel
 
 SENSORS = 6
@@ -92,35 +93,57 @@ WORDS = {
 }
 
 
-@kernel
-def check_counts(
-    counts: NDArray[np.int16],
-    noisy: int,
-    last: NDArray[np.int64],
-    same: NDArray[np.int64],
-    slope: NDArray[np.int64],
-    odd: NDArray[np.int64],
-    together: NDArray[np.int64],
-    steps: int,
-    jump: int,
-    outlier: int,
-    supply_step: int,
-    lo: int,
-    hi: int,
-    stuck: int,
-) -> int:
-    """Return 16 * channel + Implausible of the first impossible input, else 0. Only the first ``noisy`` can be stuck.
+@record
+class CheckState:
+    """The checks' memory of ``n`` inputs and of the pairs of axes."""
 
-    ``last``, ``same`` (n,) are the state: the last counts (``same[0] < 0`` before the first scan) and how often they
-    have come in a row. ``steps``: ticks since the last scan that was seen. ``slope`` (n,): last change or NO_SLOPE.
-    ``odd`` (n,) counts readings out of line: a second difference beyond ``outlier``, a step of the supply.
-    ``together`` (2,): scans since all but three of the noisy inputs bent the same way at once; how many counts that is.
-    """
+    tick: int = field("1")  # last one that was checked, -1 before the first
+    looks: int = field("1")  # how often pairs were checked
+    counts: Integers = field("counts", "n")  # of this scan, in the order of the inputs
+    last: Integers = field("counts", "n")
+    same: Integers = field("1", "n")  # how often ``last`` has come in a row, -1 before the first scan
+    slope: Integers = field("counts", "n")  # last change or NO_SLOPE
+    odd: Integers = field("1", "n")  # readings out of line: a second difference beyond ``outlier``, a supply's step
+    together: int = field("1")  # scans since all but three of the noisy inputs bent the same way at once
+    window: Array = field("m/s^2", "window", 3)  # ring of the pairs' last differences
+    sums: Array = field("m/s^2", 3)  # of the window
+    usual: Array = field("m/s^2", 3)  # slow mean of the differences
+    spread: Array = field("m/s^2", 3)  # slow mean of their distance from ``usual``
+
+
+@record
+class CheckParams:
+    """The limits. Only the first ``noisy`` inputs can be stuck."""
+
+    order: Integers = field("1", "n")  # places in a scan of the inputs
+    noisy: int = field("1")
+    jump: int = field("counts")
+    outlier: int = field("counts")
+    supply_step: int = field("counts")
+    low: int = field("counts")
+    high: int = field("counts")
+    stuck: int = field("1")
+    together: int = field("counts")  # second difference from which an input bends
+    places: Integers = field("1", 3, 2)
+    mix: Array = field("1", 3, 3)  # see ``turns_of_pairs``
+    pair_step: Array = field("m/s^2", 3)
+    pair_limit: float = field("m/s^2")
+    pair_memory: float = field("1")
+    spread_memory: float = field("1")
+
+
+@kernel
+def check_counts(tick: int, state: CheckState, params: CheckParams) -> int:
+    """Check the ``counts`` of scan ``tick``. Return 16 * channel + Implausible of the first impossible input, else
+    0."""
+    counts, last, same, slope, odd, noisy = state.counts, state.last, state.same, state.slope, state.odd, params.noisy
+    steps = tick - state.tick if state.tick >= 0 else 1  # ticks since the last scan that was seen
+    state.tick = tick
     found, up, down = 0, 0, 0
-    together[0] += steps
+    state.together += steps
     first = same[0] < 0
     for i in range(len(counts)):
-        c = np.int64(counts[i])
+        c = counts[i]
         if first:
             same[i] = 0
         elif c == last[i]:
@@ -128,26 +151,26 @@ def check_counts(
         else:
             same[i] = 0
         if found == 0:
-            if c <= lo or c >= hi:
+            if c <= params.low or c >= params.high:
                 found = 16 * i + 1
-            elif not first and abs(c - last[i]) > jump * steps:
+            elif not first and abs(c - last[i]) > params.jump * steps:
                 found = 16 * i + 2
-            elif i < noisy and same[i] >= stuck:
+            elif i < noisy and same[i] >= params.stuck:
                 found = 16 * i + 3
         if first or steps != 1:
             slope[i] = NO_SLOPE
         else:
             change = c - last[i]
             if i < noisy:
-                odd[i] += slope[i] != NO_SLOPE and abs(change - slope[i]) > outlier
-                up += slope[i] != NO_SLOPE and change - slope[i] > together[1]
-                down += slope[i] != NO_SLOPE and slope[i] - change > together[1]
+                odd[i] += slope[i] != NO_SLOPE and abs(change - slope[i]) > params.outlier
+                up += slope[i] != NO_SLOPE and change - slope[i] > params.together
+                down += slope[i] != NO_SLOPE and slope[i] - change > params.together
             elif i == noisy:
-                odd[i] += abs(change) > supply_step
+                odd[i] += abs(change) > params.supply_step
             slope[i] = change
         last[i] = c
     if max(up, down) >= noisy - 3:
-        together[0] = 0
+        state.together = 0
     return found
 
 
@@ -170,22 +193,12 @@ def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) 
 
 
 @kernel
-def check_pairs(
-    frame: NDArray[np.float64],
-    places: NDArray[np.int64],
-    mix: NDArray[np.float64],
-    looks: int,
-    window: NDArray[np.float64],
-    sums: NDArray[np.float64],
-    usual: NDArray[np.float64],
-    spread: NDArray[np.float64],
-    step: NDArray[np.float64],
-    limit: float,
-    memory: float,
-    spread_memory: float,
-) -> int:
+def check_pairs(frame: Array, state: CheckState, params: CheckParams) -> int:
     """Return the number (from 1) of a pair that disagrees permanently, minus the number of a pair that has come apart
     suddenly, else 0."""
+    window, sums, usual, spread, looks = state.window, state.sums, state.usual, state.spread, state.looks
+    places, mix = params.places, params.mix
+    state.looks += 1
     n = window.shape[0]
     row = looks % n
     found = 0
@@ -199,81 +212,36 @@ def check_pairs(
             usual[k] = sums[k] / (looks + 1)
             continue
         off = abs(apart - usual[k])
-        if abs(sums[k]) > limit * n:
+        if abs(sums[k]) > params.pair_limit * n:
             if found <= 0:
                 found = k + 1
-        elif found == 0 and looks > 4 * n and off > step[k] + PAIR_SPREADS * spread[k]:
+        elif found == 0 and looks > 4 * n and off > params.pair_step[k] + PAIR_SPREADS * spread[k]:
             found = -(k + 1)
-        usual[k] += (apart - usual[k]) * memory
-        spread[k] += (off - spread[k]) * spread_memory
+        usual[k] += (apart - usual[k]) * params.pair_memory
+        spread[k] += (off - spread[k]) * params.spread_memory
     return found
 
 
-class PairState(NamedTuple):
-    """Holds the state of ``check_pairs``. ``window`` (n, 3): ring of the last differences; ``sums`` (3,): their sums;
-    ``usual`` and ``spread`` (3,): slow means of the differences and of their distance from ``usual``."""
-
-    window: NDArray[np.float64]
-    sums: NDArray[np.float64]
-    usual: NDArray[np.float64]
-    spread: NDArray[np.float64]
-
-
-TICK, LOOKS = range(2)
-"""Places in ``CheckMemory.words``: last tick that was checked, -1 before the first; how often pairs were checked."""
-
-
 class CheckMemory(NamedTuple):
-    """Holds all that ``check_scan`` and ``check_frame`` need. ``order``: places in a scan of the inputs; ``counts``:
-    their last counts; ``limits``: the last six arguments of ``check_counts``; ``pair_limits``: those of
-    ``check_pairs``."""
+    """Holds what compiled code checks with, each a one-element array."""
 
-    words: NDArray[np.int64]
-    order: NDArray[np.int64]
-    counts: NDArray[np.int16]
-    last: NDArray[np.int64]
-    same: NDArray[np.int64]
-    slope: NDArray[np.int64]
-    odd: NDArray[np.int64]
-    together: NDArray[np.int64]
-    limits: NDArray[np.int64]
-    noisy: NDArray[np.int64]
-    pairs: PairState
-    places: NDArray[np.int64]
-    mix: NDArray[np.float64]
-    pair_step: NDArray[np.float64]
-    pair_limits: NDArray[np.float64]
+    state: Records[CheckState]
+    params: Records[CheckParams]
 
 
 @kernel
-def steps_since(words: NDArray[np.int64], tick: int) -> int:
-    """Note that scan ``tick`` is checked. Return the ticks since the one before, 1 for the first."""
-    steps = tick - words[TICK] if words[TICK] >= 0 else 1
-    words[TICK] = tick
-    return steps
-
-
-@kernel
-def check_scan(memory: CheckMemory, row: NDArray[np.int16], tick: int) -> int:
+def check_scan(row: NDArray[np.int16], tick: int, memory: CheckMemory) -> int:
     """Run ``check_counts`` on scan ``tick``, whose counts are ``row``, as ``ScanCheck.scan`` does."""
-    m, limits = memory, memory.limits
-    for i in range(len(m.order)):
-        m.counts[i] = row[m.order[i]]
-    return check_counts(
-        m.counts, m.noisy[0], m.last, m.same, m.slope, m.odd, m.together, steps_since(m.words, tick), limits[0],
-        limits[1], limits[2], limits[3], limits[4], limits[5],
-    )  # fmt: skip
+    state, params = memory.state[0], memory.params[0]
+    for i in range(len(params.order)):
+        state.counts[i] = row[params.order[i]]
+    return check_counts(tick, state, params)
 
 
 @kernel
-def check_frame(memory: CheckMemory, frame: NDArray[np.float64]) -> int:
+def check_frame(frame: Array, memory: CheckMemory) -> int:
     """Run ``check_pairs`` on ``frame``, as ``ScanCheck.pairs`` does."""
-    m, p = memory, memory.pairs
-    m.words[LOOKS] += 1
-    return check_pairs(
-        frame, m.places, m.mix, m.words[LOOKS] - 1, p.window, p.sums, p.usual, p.spread, m.pair_step, m.pair_limits[0],
-        m.pair_limits[1], m.pair_limits[2],
-    )  # fmt: skip
+    return check_pairs(frame, memory.state[0], memory.params[0])
 
 
 class ScanCheck:
@@ -302,51 +270,60 @@ class ScanCheck:
         self._labels = tuple(labels)
         n = len(columns)
         self._seen_total = 0
-        volts = (limits.jump_V, limits.outlier_V, limits.supply_step_V, *limits.rail_V)
+
+        def counts(volts: float) -> int:
+            return round(volts / lsb_V)
+
+        sizes = {"n": n, "window": max(2, round(limits.pair_s / TICK_S))}
         self.memory = CheckMemory(
-            np.array([-1, 0]), np.array(columns, dtype=np.int64), np.zeros(n, dtype=np.int16),
-            np.zeros(n, dtype=np.int64), np.full(n, -1, dtype=np.int64), np.full(n, NO_SLOPE),
-            np.zeros(n, dtype=np.int64), np.array([NO_SLOPE, round(TOGETHER_V / lsb_V)]),
-            np.array([*(round(v / lsb_V) for v in volts), limits.stuck_ticks]), np.array([sensors]),
-            PairState(
-                np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3))
+            new(CheckState, sizes, tick=-1, same=np.full(n, -1), slope=np.full(n, NO_SLOPE), together=NO_SLOPE),
+            new(
+                CheckParams,
+                order=np.array(columns, dtype=np.int64),
+                noisy=sensors,
+                jump=counts(limits.jump_V),
+                outlier=counts(limits.outlier_V),
+                supply_step=counts(limits.supply_step_V),
+                low=counts(limits.rail_V[0]),
+                high=counts(limits.rail_V[1]),
+                stuck=limits.stuck_ticks,
+                together=counts(TOGETHER_V),
+                places=PAIR_PLACES,
+                mix=np.eye(len(PAIRS)) if mix is None else mix,
+                pair_step=limits.pair_step_m_s2,
+                pair_limit=limits.pair_m_s2,
+                pair_memory=TICK_S / limits.pair_memory_s,
+                spread_memory=TICK_S / SPREAD_S,
             ),
-            PAIR_PLACES, np.eye(len(PAIRS)) if mix is None else mix, np.array(limits.pair_step_m_s2),
-            np.array([limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S]),
-        )  # fmt: skip
-        # handed over one by one, because a tuple of arrays costs each call 10 us
-        self._limits, self._pair_limits = self.memory.limits.tolist(), self.memory.pair_limits.tolist()
+        )
+        self._record, self._limits = self.memory.state[0], self.memory.params[0]
+        self._state: CheckState = attributes(self.memory.state)[0]
+        self._counts, self._last, self._odd = self._state.counts, self._state.last, self._state.odd
+        self._order, self._jump = self.memory.params["order"][0], counts(limits.jump_V)
+        self._middle = (counts(limits.rail_V[0]) + counts(limits.rail_V[1])) // 2
         self._pair_code = 0
         self._load_kernels()
 
     def _load_kernels(self) -> None:
         """Compile or load the kernels before the first scan arrives. The state does not change."""
-        m = self.memory
-        last, same, slope, odd = (state.copy() for state in (m.last, m.same, m.slope, m.odd))
-        steps_since(m.words.copy(), 0)
-        check_counts(m.counts, self._sensors, last, same, slope, odd, m.together.copy(), 1, *self._limits)
-        window, sums, usual, spread = (state.copy() for state in m.pairs)
-        frame = np.zeros(LAYOUT.size)
-        check_pairs(frame, m.places, m.mix, 0, window, sums, usual, spread, m.pair_step, *self._pair_limits)
+        state = cast("Records[CheckState]", np.array(self.memory.state))
+        check_counts(0, state[0], self._limits)
+        check_pairs(np.zeros(LAYOUT.size), state[0], self._limits)
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
         """Check the counts of scan ``tick``. Return an empty string, or a message that says what is wrong."""
-        memory = self.memory
-        np.take(row, memory.order, out=memory.counts)
+        counts, last = self._counts, self._last
+        counts[:] = row[self._order]
         for channel in self._ignored:
-            memory.counts[channel] = self._quiet(tick)
+            counts[channel] = self._quiet(tick)
         supply = self._supply
-        supply_before = 0 if supply is None else int(memory.last[supply])
-        found = check_counts(
-            memory.counts, self._sensors, memory.last, memory.same, memory.slope, memory.odd, memory.together,
-            steps_since(memory.words, tick), *self._limits,
-        )  # fmt: skip
+        supply_before = 0 if supply is None else int(last[supply])
+        found = check_counts(tick, self._record, self._limits)
         if not found:
             return ""
         channel, finding = divmod(found, 16)
         self.channel = channel
-        jump = self._limits[0]
-        if supply is not None and supply_before and abs(int(memory.counts[supply]) - supply_before) > jump // 2:
+        if supply is not None and supply_before and abs(int(counts[supply]) - supply_before) > self._jump // 2:
             # the sensors are ratiometric: all of them follow their supply
             return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
         return f"{self._labels[channel]} {WORDS[Implausible(finding)].format(n=self.limits.stuck_ticks)}"
@@ -354,17 +331,16 @@ class ScanCheck:
     def ignore(self, channel: int) -> None:
         """Treat ``channel`` as healthy from now on, whatever it reads."""
         self._ignored.append(channel)
-        memory = self.memory
-        memory.last[channel], memory.slope[channel] = self._quiet(int(memory.words[TICK])), NO_SLOPE
+        self._last[channel], self._state.slope[channel] = self._quiet(self._state.tick), NO_SLOPE
 
     def _quiet(self, tick: int) -> int:
-        return (self._limits[3] + self._limits[4]) // 2 + tick % 2
+        return self._middle + tick % 2
 
     @property
     def stepped_together(self) -> bool:
         """True if, within the last ``TOGETHER_TICKS``, nearly all axes bent the same way at once, as they do when their
         supply steps."""
-        return bool(self.memory.together[0] <= TOGETHER_TICKS)
+        return bool(self._state.together <= TOGETHER_TICKS)
 
     def odd(self) -> str:
         """Return a message about an input that was out of line since the last call, or an empty string. Such a reading
@@ -373,11 +349,11 @@ class ScanCheck:
             i, j, axis = PAIRS[self._pair_code - 1]
             self._pair_code = 0
             return f"{self._labels[i]} and {self._labels[j]} came apart along {axis}"
-        total = int(self.memory.odd.sum())
+        total = int(self._odd.sum())
         if total == self._seen_total:
             return ""
         self._seen_total = total
-        worst = int(self.memory.odd.argmax())
+        worst = int(self._odd.argmax())
         if worst == self._supply:
             return f"{self._labels[worst]} stepped"
         return f"{self._labels[worst]} read a value out of line with its neighbours"
@@ -389,14 +365,7 @@ class ScanCheck:
         The mean over 0.1 s leaves out most of a tremor. A difference that has lasted for seconds comes from
         calibration, or was there before; a new difference is a drift or a blow.
         """
-        m, p = self.memory, self.memory.pairs
-        looks = int(m.words[LOOKS])
-        m.words[LOOKS] = looks + 1
-        return self.judge_pairs(
-            check_pairs(
-                frame, m.places, m.mix, looks, p.window, p.sums, p.usual, p.spread, m.pair_step, *self._pair_limits
-            )
-        )
+        return self.judge_pairs(check_pairs(frame, self._record, self._limits))
 
     def judge_pairs(self, found: int) -> str:
         """Return the message of what ``check_pairs`` found, as ``pairs`` does."""
@@ -406,8 +375,7 @@ class ScanCheck:
             self._pair_code = -found
             return ""
         i, j, axis = PAIRS[found - 1]
-        pairs = self.memory.pairs
-        apart = pairs.sums[found - 1] / len(pairs.window)
+        apart = self._state.sums[found - 1] / len(self._state.window)
         return (
             f"{self._labels[i]} and {self._labels[j]} disagree by {apart:.2f} m/s^2 along {axis}: "
             "one of them has drifted or is calibrated wrongly"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.control.chain import COMMANDED, HELD, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
+from firmware_py.control.chain import COMMANDED, HELD, MANUAL, PARTS, bind, memory_dtype, run_kernel, step_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STATUS
 from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig
@@ -66,9 +66,9 @@ class Stages:
         self.tremor = Tremor(configs.tremor)
         self.detectors = Detectors(configs.tremor.detectors, configs.tremor.tick_hz)
         self.actuation = Actuation(configs.actuation)
-        self.memory = self._gathered()
-        """Holds the frame and all that the stages know in one record (``chain.memory_dtype``), which is never moved."""
-        self.frame: Frame = self.memory["frame"][0]
+        self._memory = self._gathered()
+        self._is_bound = False
+        self.frame: Frame = self._memory["frame"][0]
         self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
 
     def _stages(self) -> tuple[Sensing, Tremor, Detectors, Actuation]:
@@ -86,13 +86,22 @@ class Stages:
         return memory
 
     @property
+    def memory(self) -> Record:
+        """Return the frame and all that the stages know in one record (``chain.memory_dtype``), which is never moved.
+        The first call compiles or loads the stages' kernels."""
+        if not self._is_bound:
+            bind(self._memory)
+            self._is_bound = True
+        return self._memory
+
+    @property
     def arguments(self) -> tuple[Record, ...]:
         """Return state and parameters of every stage, in the order of ``chain.PARTS``."""
         return tuple(part for stage in self._stages() for part in (stage.state, stage.params))
 
     def step(self) -> None:
         """Run one tick on ``frame``, whose input columns and ``GIVEN_BITS`` of the status are set."""
-        step_kernel(self.memory)
+        step_kernel(self._memory if self._is_bound else self.memory)
 
     def run(self, rows: Frame) -> None:
         """Run the ticks ``rows`` (n, Layout.size), C order, in place. The numbers are those of n steps; the state
@@ -115,22 +124,18 @@ class Stages:
         self.frame[STATUS] = int(self.frame[STATUS]) | HELD
 
     def warm_up(self, *, batch: bool = False) -> None:
-        """Compile or load the kernels of ``step``, then reset the state. A cold start takes a minute, which a tick may
-        not. ``batch`` includes the kernels of ``run``, which only replay needs."""
+        """Compile or load the kernels of ``step``, then reset the state. A cold start takes half a minute, which a tick
+        may not. ``batch`` includes the kernels of ``run``, which only replay needs."""
         self.step()
         if batch:
             self.run(np.zeros((1, LAYOUT.size)))
         self.reset()
 
-    def warm_up_motion(self) -> None:
-        """Compile the stages after sensing, apart from the step that calls them all: two processes share the work."""
-        for stage in (self.tremor, self.detectors, self.actuation):
-            stage.step(self.frame)
-        self.reset()
-
-    def warm_up_sensing(self) -> None:
-        """Compile the sensing stage, apart from the step."""
-        self.sensing.step(self.frame)
+    def warm_up_parts(self, *parts: str) -> None:
+        """Compile some of ``chain.PARTS``, apart from the step: two processes share the work."""
+        for name, stage in zip(PARTS, self._stages(), strict=True):
+            if name in parts:
+                stage.step(self.frame)
         self.reset()
 
     def reset(self) -> None:

@@ -9,18 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.designs import design
-from firmware_py.records import Record, new_record
+from firmware_py.records import Records, new
 from firmware_py.sensing.config import DRIFT_S, SensingConfig
-from firmware_py.sensing.error_state_records import ERROR_STATE
-from firmware_py.sensing.quaternion_kalman import QUATERNION_KALMAN
+from firmware_py.sensing.error_state_records import ErrorStateParams
+from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanParams
 from hal.types import STANDARD_GRAVITY
 
-OBSERVER, ERROR_STATE_METHOD, QUATERNION_KALMAN_METHOD = 0, 1, 2
-METHODS = {
-    "observer": OBSERVER,
-    "error-state": ERROR_STATE_METHOD,
-    "quaternion-kalman": QUATERNION_KALMAN_METHOD,
-}
 TREMOR_RAD_S2 = 0.5
 GYRO_WHITE = 0.006
 """deg/s/sqrt(Hz): Allan deviation of the gyroscope of BROAD at rest, 0.1 to 1 s (one-sided, as a turn's growth)."""
@@ -96,11 +90,11 @@ def tremor_notch(tick_hz: float, middle_hz: float, width_hz: float) -> NDArray[n
     return np.array([*b, a[1], a[2]])
 
 
-def error_state_params(config: SensingConfig) -> Record:
-    """Numbers of the error-state filter (dtype ``ERROR_STATE``) driven by accelerometers."""
+def error_state_params(config: SensingConfig) -> Records[ErrorStateParams]:
+    """Numbers of the error-state filter driven by accelerometers."""
     density = np.diag(motion_densities(config))
-    return new_record(
-        ERROR_STATE,
+    return new(
+        ErrorStateParams,
         turn_density=1e-12,
         lead=0.5,
         velocity_gate=config.velocity_gate,
@@ -125,7 +119,7 @@ def error_state_params(config: SensingConfig) -> Record:
     )
 
 
-def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
+def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Records[ErrorStateParams]:
     """The same filter for a consumer gyroscope, accelerometer and magnetometer on a moving person (BROAD).
 
     A sample of such a gyroscope is the mean over the interval before it, so it turns the whole interval (``lead`` 1).
@@ -136,8 +130,8 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
     and Seel 2023; magRefTau, magNewTime, magNewMinGyr of the package vqf 2.1).
     """
     deg = radians(1.0)
-    return new_record(
-        ERROR_STATE,
+    return new(
+        ErrorStateParams,
         turn_density=(GYRO_WHITE * deg) ** 2,
         lead=1.0,
         turn_per_rate=2.0 * GYRO_SCALE_ERROR**2,
@@ -163,11 +157,11 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
     )
 
 
-def quaternion_kalman_params(config: SensingConfig) -> Record:
-    """Numbers of the quaternion filter (dtype ``QUATERNION_KALMAN``) driven by accelerometers."""
+def quaternion_kalman_params(config: SensingConfig) -> Records[QuaternionKalmanParams]:
+    """Numbers of the quaternion filter driven by accelerometers."""
     density = np.diag(motion_densities(config))
-    return new_record(
-        QUATERNION_KALMAN,
+    return new(
+        QuaternionKalmanParams,
         turn_density=1e-12,
         # no state for the bias of alpha here: its drift is rate drift
         rate_density=density[3:] + DRIFT_S * alpha_drift_densities(config),
@@ -181,11 +175,11 @@ def quaternion_kalman_params(config: SensingConfig) -> Record:
     )
 
 
-def gyroscope_quaternion_kalman(gravity_m_s2: float = 9.81) -> Record:
+def gyroscope_quaternion_kalman(gravity_m_s2: float = 9.81) -> Records[QuaternionKalmanParams]:
     """The quaternion filter for a consumer gyroscope."""
     deg = radians(1.0)
-    return new_record(
-        QUATERNION_KALMAN,
+    return new(
+        QuaternionKalmanParams,
         turn_density=(0.02 * deg) ** 2,
         rate_density=(0.003 * deg) ** 2,
         lead=1.0,

@@ -20,13 +20,24 @@ Sequential scalar updates in Joseph form, each gated at ``gate`` standard deviat
 
 from __future__ import annotations
 
-from math import atan2, exp, sqrt
+from math import asin, atan2, exp, sqrt
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from firmware_py.records import Record
-from firmware_py.sensing.error_state_records import BIAS, DISTURBANCE, ERRORS, RATE, TURN, VELOCITY
+from firmware_py.records import Array
+from firmware_py.sensing.attitude_filter import AttitudeFilter, Motion
+from firmware_py.sensing.attitude_params import error_state_params
+from firmware_py.sensing.error_state_records import (
+    BIAS,
+    DISTURBANCE,
+    ERRORS,
+    RATE,
+    TURN,
+    VELOCITY,
+    ErrorState,
+    ErrorStateAttitude,
+    ErrorStateNumbers,
+    ErrorStateParams,
+)
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
 from hal.scratch import scratch
@@ -38,29 +49,32 @@ HELD_AFTER_S = 0.2
 
 
 @kernel
-def start_errors(state: Record, params: Record, field_size: float, field_dip: float) -> None:
+def begin_errors(field: Array, state: ErrorStateAttitude, params: ErrorStateNumbers) -> None:
     """Set the covariance and the start values of a filter that has just been aligned."""
-    e = state.error_state
+    e, numbers = state.error_state, params.error_state
+    c = state.matrix
+    up = c[2, 0] * field[0] + c[2, 1] * field[1] + c[2, 2] * field[2]
+    size = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
     p = e.covariance
     p[:, :] = 0.0
-    variances = params.start_variance
+    variances = numbers.start_variance
     for i in range(3):
         p[TURN + i, TURN + i] = variances[0] if i < 2 else variances[1]
         p[RATE + i, RATE + i] = variances[2]
-        p[BIAS + i, BIAS + i] = params.start_bias_variance[i]
+        p[BIAS + i, BIAS + i] = numbers.start_bias_variance[i]
         p[VELOCITY + i, VELOCITY + i] = variances[3]
         e.velocity[i] = 0.0
         e.notch[i, 0] = 0.0
         e.notch[i, 1] = 0.0
         e.trusted[i] = state.field[i]
         for j in range(3):
-            e.corrected[i, j] = 0.0
+            state.corrected[i, j] = 0.0
         e.slow_rate[i] = state.rate[i]
         e.slow_force[i] = 0.0
-    p[DISTURBANCE, DISTURBANCE] = params.disturbance_rad**2
+    p[DISTURBANCE, DISTURBANCE] = numbers.disturbance_rad**2
     e.disturbance = 0.0
-    e.field_size = field_size
-    e.field_dip = field_dip
+    e.field_size = 0.0
+    e.field_dip = asin(max(-1.0, min(1.0, -up / size))) if size > 0.0 else 0.0
     e.field_wait_s = 0.0
     e.field_fresh_s = 0.0
     e.candidate_size = 0.0
@@ -75,11 +89,11 @@ def start_errors(state: Record, params: Record, field_size: float, field_dip: fl
 
 @kernel
 def propagate_errors(
-    e: Record,
-    params: Record,
-    c: NDArray[np.float64],
-    up: NDArray[np.float64],
-    rate: NDArray[np.float64],
+    e: ErrorState,
+    params: ErrorStateParams,
+    c: Array,
+    up: Array,
+    rate: Array,
     dt: float,
 ) -> None:
     """Propagate P <- F P F^T + Q over ``dt`` s; ``c`` = C_WB, ``up`` (3,) = C f. F is sparse, so its products are
@@ -127,16 +141,25 @@ def propagate_errors(
     p[DISTURBANCE, DISTURBANCE] += params.disturbance_rad**2 * (1.0 - fade * fade)
 
 
+class Measurement(NamedTuple):
+    """A scalar measurement of error ``first`` (minus error ``second``, if >= 0), not used beyond ``gate`` standard
+    deviations."""
+
+    first: int
+    second: int
+    residual: float
+    variance: float
+    gate: float
+
+
 @kernel
-def correct(
-    state: Record, first: int, second: int, residual: float, variance: float, gate: float, gain: NDArray[np.float64]
-) -> bool:
-    """Process one scalar measurement of error ``first`` (minus error ``second``, if >= 0), in Joseph form.
+def correct(measured: Measurement, e: ErrorState, gain: Array) -> bool:
+    """Process one measurement, in Joseph form.
 
     ``gain`` (ERRORS,) gathers the correction, which the caller applies with ``apply_correction``. False when the
-    residual, what ``gain`` already explains taken off, is beyond ``gate`` standard deviations.
+    residual, what ``gain`` already explains taken off, is beyond the gate.
     """
-    e = state.error_state
+    first, second, residual, variance, gate = measured
     p = e.covariance
     column = scratch(ERRORS)
     for i in range(ERRORS):
@@ -164,7 +187,7 @@ def correct(
 
 
 @kernel
-def apply_correction(state: Record, x: NDArray[np.float64]) -> None:
+def apply_correction(state: ErrorStateAttitude, x: Array) -> None:
     """Fold the estimated errors ``x`` (ERRORS,) into the state and clear them."""
     c = state.matrix
     tx = c[0, 0] * x[0] + c[1, 0] * x[1] + c[2, 0] * x[2]
@@ -173,10 +196,10 @@ def apply_correction(state: Record, x: NDArray[np.float64]) -> None:
     rotate_by(state.quaternion, tx, ty, tz)
     to_matrix(state.quaternion, state.matrix)
     e = state.error_state
-    e.corrected[0, 0], e.corrected[0, 1], e.corrected[0, 2] = tx, ty, tz
+    state.corrected[0, 0], state.corrected[0, 1], state.corrected[0, 2] = tx, ty, tz
     for i in range(3):
-        e.corrected[1, i] = x[RATE + i]
-        e.corrected[2, i] += x[BIAS + i]
+        state.corrected[1, i] = x[RATE + i]
+        state.corrected[2, i] += x[BIAS + i]
         state.rate[i] += x[RATE + i]
         state.bias[i] += x[BIAS + i]
         e.velocity[i] += x[VELOCITY + i]
@@ -186,19 +209,10 @@ def apply_correction(state: Record, x: NDArray[np.float64]) -> None:
 
 
 @kernel
-def error_state_step(
-    state: Record,
-    params: Record,
-    force: NDArray[np.float64],
-    alpha: NDArray[np.float64],
-    field: NDArray[np.float64],
-    fresh: bool,
-    dt: float,
-) -> None:
-    """Run one step of ``dt`` s with ``force`` (3,) m/s^2, ``alpha`` (3,) rad/s^2, body frame; ``field`` if ``fresh``.
-
-    Updates quaternion, matrix, rate and bias in ``state``.
-    """
+def error_state_step(motion: Motion, state: ErrorStateAttitude, param: ErrorStateNumbers) -> None:
+    """Run one step. The state's field counts where the motion is ``fresh``."""
+    params, dt = param.error_state, motion.dt_s
+    force, alpha = motion.force, motion.alpha
     e = state.error_state
     c = state.matrix
     turn = scratch(3)
@@ -228,7 +242,7 @@ def error_state_step(
         seen = params.notch[0] * e.velocity[i] + e.notch[i, 0]
         e.notch[i, 0] = params.notch[1] * e.velocity[i] - params.notch[3] * seen + e.notch[i, 1]
         e.notch[i, 1] = params.notch[2] * e.velocity[i] - params.notch[4] * seen
-        moving = not correct(state, VELOCITY + i, -1, -seen, params.still_density / dt, gate, x) or moving
+        moving = not correct(Measurement(VELOCITY + i, -1, -seen, params.still_density / dt, gate), e, x) or moving
     if moving:
         e.gated += 1
         e.moving_s += dt
@@ -238,22 +252,22 @@ def error_state_step(
         e.moving_s = 0.0
     if resting:
         for i in range(3):
-            correct(state, RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9, x)
+            correct(Measurement(RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9), e, x)
     e.field_fresh_s += dt
     e.field_wait_s += dt
-    if fresh:
-        _heading(state, params, field, x)
+    if motion.fresh:
+        _heading(state, params, state.field, x)
         e.field_fresh_s = 0.0
     if params.held_density > 0.0 and e.field_wait_s > HELD_AFTER_S:
         b = e.trusted
         north = c[0, 0] * b[0] + c[0, 1] * b[1] + c[0, 2] * b[2]
         west = c[1, 0] * b[0] + c[1, 1] * b[1] + c[1, 2] * b[2]
-        correct(state, TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9, x)
+        correct(Measurement(TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9), e, x)
     apply_correction(state, x)
 
 
 @kernel
-def _forget_velocity(e: Record) -> None:
+def _forget_velocity(e: ErrorState) -> None:
     """Start the velocity anew at zero, as uncertain as it was wrong, without correlation to the rest."""
     p = e.covariance
     for i in range(3):
@@ -269,7 +283,7 @@ def _forget_velocity(e: Record) -> None:
 
 
 @kernel
-def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+def _heading(state: ErrorStateAttitude, params: ErrorStateParams, field: Array, x: Array) -> None:
     """Correct the heading with a field that looks like the learned one."""
     e = state.error_state
     c = state.matrix
@@ -300,9 +314,8 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
         e.candidate_s = 0.0
         for i in range(3):
             e.trusted[i] = field[i]
-        correct(
-            state, TURN + 2, DISTURBANCE, e.disturbance - atan2(west, north), params.heading_density / since, 1e9, x
-        )
+        residual = e.disturbance - atan2(west, north)
+        correct(Measurement(TURN + 2, DISTURBANCE, residual, params.heading_density / since, 1e9), e, x)
         return
     e.rejected += 1
     # a field that has been steady elsewhere for long is the new environment
@@ -327,7 +340,7 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
 
 
 @kernel
-def _resting(state: Record, params: Record, force: NDArray[np.float64], dt: float) -> bool:
+def _resting(state: ErrorStateAttitude, params: ErrorStateParams, force: Array, dt: float) -> bool:
     """Return True if rate and force have stayed at their slow means for ``rest_s``."""
     e = state.error_state
     smoothing = min(1.0, dt / REST_SMOOTHING_S)
@@ -350,3 +363,8 @@ def _resting(state: Record, params: Record, force: NDArray[np.float64], dt: floa
     else:
         e.still_s += dt
     return e.still_s > params.rest_s
+
+
+ERROR_STATE_FILTER = AttitudeFilter(
+    ErrorStateNumbers, ErrorStateAttitude, error_state_params, begin_errors, error_state_step
+)

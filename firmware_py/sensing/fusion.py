@@ -6,28 +6,27 @@ from math import asin, atan2, degrees
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Record, Records, field, new, record
 from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.fusion_filters import (
     COMPLEMENTARY,
-    FUSION,
-    FUSION_STATE,
     GYROSCOPE,
     MADGWICK,
     MAHONY,
     TILT,
+    FusionParams,
+    FusionSample,
+    FusionState,
     begin_fusion,
     run_fusion,
     step_fusion,
 )
-from firmware_py.sensing.gyroscope_filter import KALMAN_MEMORY, begin_gyroscope, run_gyroscope, step_gyroscope
+from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope, step_gyroscope
 from hal.compiled import kernel
 from hal.errors import BenchError
 
-Array = NDArray[np.float64]
 ALIGN_S = 0.1
 Method = Literal["tilt", "gyroscope", "complementary", "madgwick", "mahony", "error-state", "vqf"]
 NATIVE = {
@@ -62,27 +61,27 @@ class FusionConfig(BaseModel):
     """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
 
 
-MEMORY = np.dtype(
-    [
-        ("state", FUSION_STATE, (1,)),
-        ("params", FUSION, (1,)),
-        ("rate", "f8", (3,)),
-        ("force", "f8", (3,)),
-        ("field", "f8", (3,)),
-        ("dt_s", "f8", (1,)),
-    ]
-)
-"""The filter and one sample: each array handed to a kernel costs about 0.35 us a call, so a sample hands over one."""
+@record
+class FusionMemory:
+    """The filter and one sample: each array handed to a kernel costs about 0.35 us a call, so a sample hands over
+    one."""
+
+    state: Records[FusionState] = field("", 1)
+    params: Records[FusionParams] = field("", 1)
+    rate: Array = field("rad/s", 3)
+    force: Array = field("any", 3)
+    dt_s: Array = field("s", 1)
+    field: Array = field("any", 3)
 
 
 @kernel
-def _step_one(memory: Record) -> None:
+def _step_one(memory: Records[FusionMemory]) -> None:
     m = memory[0]
-    step_fusion(m.state[0], m.params[0], m.rate, m.force, m.field, m.dt_s[0])
+    step_fusion(FusionSample(m.rate, m.force, m.field, m.dt_s[0]), m.state[0], m.params[0])
 
 
 @kernel
-def _begin(state: NDArray[np.void], params: NDArray[np.void]) -> None:
+def _begin(state: Records[FusionState], params: Records[FusionParams]) -> None:
     begin_fusion(state[0], params[0])
 
 
@@ -99,8 +98,8 @@ class Fusion:
         self.config = config
         self.rate_hz = rate_hz
         self._vqf: Any = _open_vqf(rate_hz) if config.method == "vqf" else None
-        params = new_record(
-            FUSION,
+        params = new(
+            FusionParams,
             method=NATIVE.get(config.method, MAHONY),
             tau_s=config.tau_s,
             beta=config.beta,
@@ -111,11 +110,11 @@ class Fusion:
         )
         self._kalman = config.method == "error-state"
         if self._kalman:
-            self._memory = new_record(KALMAN_MEMORY)
+            self._memory: Record = new(GyroscopeMemory)
             self._memory["params"]["error_state"] = gyroscope_error_state()
             self._memory["params"]["align_samples"] = round(config.align_s * rate_hz)
         else:
-            self._memory = new_record(MEMORY, params=params)
+            self._memory = new(FusionMemory, params=params)
         self._state, self._params = (self._memory[name][0] for name in ("state", "params"))
         self._rate, self._force, self._field, self._dt_s = (
             self._memory[name][0] for name in ("rate", "force", "field", "dt_s")
@@ -170,7 +169,7 @@ class Fusion:
             if self._kalman:
                 run_gyroscope(self._memory, w, f, b, dt, out)
             elif self._vqf is None:
-                run_fusion(self._state, self._params, w, f, b, dt, out)
+                run_fusion(FusionSample(w, f, b, dt), out, self._state, self._params)
             else:
                 for k in range(n):
                     out[k] = self.step(w[k], f[k], b[k])

@@ -7,42 +7,55 @@ the heading (Madgwick, Harrison, Vaidyanathan 2011; Mahony, Hamel, Pflimlin 2008
 from __future__ import annotations
 
 from math import acos, atan2, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record
+from firmware_py.records import Array, Records, field, record
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
 
 TILT, GYROSCOPE, COMPLEMENTARY, MADGWICK, MAHONY = 0, 1, 2, 3, 4
 
-FUSION = np.dtype(
-    [
-        ("method", "i8"),
-        ("tau_s", "f8"),  # complementary filter (3.30)
-        ("beta", "f8"),  # Madgwick (3.73), rad/s
-        ("field_scale", "f8"),  # Madgwick: predicted field over measured one
-        ("kp", "f8"),  # Mahony (3.78), 1/s
-        ("ki", "f8"),  # 1/s^2
-        ("align_samples", "f8"),
-    ]
-)
-FUSION_STATE = np.dtype(
-    [
-        ("quaternion", "f8", (4,)),
-        ("matrix", "f8", (3, 3)),
-        ("integral", "f8", (3,)),  # K_I times the integral of Mahony's error, rad/s
-        ("sums", "f8", (2, 3)),  # force and field while aligning
-        ("samples", "f8"),
-        ("aligned", "i8"),
-    ]
-)
+
+class FusionSample(NamedTuple):
+    """A sample, or all of a recording, body frame: rate rad/s, force and field of any unit (nan: none), and the time
+    since the sample before, s."""
+
+    rate: Array
+    force: Array
+    field: Array
+    dt_s: Any
+
+
+@record
+class FusionParams:
+    """Numbers of all filters; ``method`` selects one."""
+
+    method: int = field("1")
+    tau_s: float = field("s")  # complementary filter (3.30)
+    beta: float = field("rad/s")  # Madgwick (3.73)
+    field_scale: float = field("1")  # Madgwick: predicted field over measured one
+    kp: float = field("1/s")  # Mahony (3.78)
+    ki: float = field("1/s^2")
+    align_samples: float = field("1")
+
+
+@record
+class FusionState:
+    """The attitude, and what the filters and the alignment remember."""
+
+    quaternion: Array = field("1", 4)
+    matrix: Array = field("1", 3, 3)
+    integral: Array = field("rad/s", 3)  # K_I times the integral of Mahony's error
+    sums: Array = field("any", 2, 3)  # force and field while aligning
+    samples: float = field("1")
+    aligned: int = field("1")
 
 
 @kernel
-def begin_fusion(state: Record, params: Record) -> None:
+def begin_fusion(state: FusionState, params: FusionParams) -> None:
     """Forget everything. With ``align_samples`` 0 the attitude starts at (1, 0, 0, 0), as the document's filters do."""
     state.quaternion[:] = 0.0
     state.quaternion[0] = 1.0
@@ -54,26 +67,19 @@ def begin_fusion(state: Record, params: Record) -> None:
 
 
 @kernel
-def step_fusion(
-    state: Record,
-    params: Record,
-    rate: NDArray[np.float64],
-    force: NDArray[np.float64],
-    field: NDArray[np.float64],
-    dt_s: float,
-) -> None:
-    """Filter one sample, ``dt_s`` after the last: rate rad/s, force and field (any unit; nan: none), all (3,), body
-    frame."""
+def step_fusion(sample: FusionSample, state: FusionState, params: FusionParams) -> None:
+    """Filter one sample."""
+    rate, force, field, dt_s = sample
     if state.aligned == 0:
         _align(state, params, force, field)
         return
     q = state.quaternion
     method = params.method
     if method == MADGWICK:
-        _madgwick(q, rate, force, field, params.beta, params.field_scale, dt_s)
+        _madgwick(sample, state, params)
         return
     if method == MAHONY:
-        _mahony(state, rate, force, field, params.kp, params.ki, dt_s)
+        _mahony(sample, state, params)
         return
     if method != TILT:
         rotate_by(q, rate[0] * dt_s, rate[1] * dt_s, rate[2] * dt_s)
@@ -84,7 +90,7 @@ def step_fusion(
 
 
 @kernel
-def _align(state: Record, params: Record, force: NDArray[np.float64], field: NDArray[np.float64]) -> None:
+def _align(state: FusionState, params: FusionParams, force: Array, field: Array) -> None:
     """Mean force and field, then TRIAD; without a field the heading of the body's x axis is zero."""
     for i in range(3):
         state.sums[0, i] += force[i]
@@ -100,7 +106,7 @@ def _align(state: Record, params: Record, force: NDArray[np.float64], field: NDA
 
 
 @kernel
-def _lean(state: Record, force: NDArray[np.float64], share: float) -> None:
+def _lean(state: FusionState, force: Array, share: float) -> None:
     """Turn by ``share`` of the angle that takes the predicted up to the measured one; heading stays."""
     q, c = state.quaternion, state.matrix
     norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
@@ -121,7 +127,7 @@ def _lean(state: Record, force: NDArray[np.float64], share: float) -> None:
 
 
 @kernel
-def _horizontal_field(q: NDArray[np.float64], mx: float, my: float, mz: float) -> tuple[float, float]:
+def _horizontal_field(q: Array, mx: float, my: float, mz: float) -> tuple[float, float]:
     """(b_x, b_z): length of the field's horizontal part and its vertical part, in the world of ``q``."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     hx = mx * (1.0 - 2.0 * (y * y + z * z)) + my * 2.0 * (x * y - w * z) + mz * 2.0 * (x * z + w * y)
@@ -131,16 +137,10 @@ def _horizontal_field(q: NDArray[np.float64], mx: float, my: float, mz: float) -
 
 
 @kernel
-def _madgwick(
-    q: NDArray[np.float64],
-    rate: NDArray[np.float64],
-    force: NDArray[np.float64],
-    field: NDArray[np.float64],
-    beta: float,
-    field_scale: float,
-    dt_s: float,
-) -> None:
+def _madgwick(sample: FusionSample, state: FusionState, params: FusionParams) -> None:
     """(3.65)-(3.74) with errata 105, 107; the field's rows as in Madgwick 2011."""
+    rate, force, field, dt_s = sample
+    q, beta, field_scale = state.quaternion, params.beta, params.field_scale
     w, x, y, z = q[0], q[1], q[2], q[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
@@ -171,17 +171,10 @@ def _madgwick(
 
 
 @kernel
-def _mahony(
-    state: Record,
-    rate: NDArray[np.float64],
-    force: NDArray[np.float64],
-    field: NDArray[np.float64],
-    kp: float,
-    ki: float,
-    dt_s: float,
-) -> None:
+def _mahony(sample: FusionSample, state: FusionState, params: FusionParams) -> None:
     """(3.75)-(3.80) with erratum 108."""
-    q = state.quaternion
+    rate, force, field, dt_s = sample
+    q, kp, ki = state.quaternion, params.kp, params.ki
     w, x, y, z = q[0], q[1], q[2], q[3]
     ex, ey, ez = 0.0, 0.0, 0.0
     norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
@@ -214,9 +207,7 @@ def _mahony(
 
 
 @kernel
-def _integrate(
-    q: NDArray[np.float64], gx: float, gy: float, gz: float, push: tuple[float, float, float, float], dt_s: float
-) -> None:
+def _integrate(q: Array, gx: float, gy: float, gz: float, push: tuple[float, float, float, float], dt_s: float) -> None:
     """q + (q x (0, w) / 2 - push) dt and normalised: first order, as (3.59), (3.60), (3.73) have it."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     q[0] += (0.5 * (-x * gx - y * gy - z * gz) - push[0]) * dt_s
@@ -229,18 +220,11 @@ def _integrate(
 
 
 @kernel
-def run_fusion(
-    state: NDArray[np.void],
-    params: NDArray[np.void],
-    rate: NDArray[np.float64],
-    force: NDArray[np.float64],
-    field: NDArray[np.float64],
-    dt_s: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    """A recording: ``out`` (n, 4) from (n, 3) arrays; ``dt_s`` (n,) before each sample."""
+def run_fusion(samples: FusionSample, out: Array, state: Records[FusionState], params: Records[FusionParams]) -> None:
+    """Filter a recording: attitudes ``out`` (n, 4) from (n, 3) arrays and times (n,)."""
     s, p = state[0], params[0]
+    rate, force, field, dt_s = samples
     for k in range(len(rate)):
-        step_fusion(s, p, rate[k], force[k], field[k], dt_s[k])
+        step_fusion(FusionSample(rate[k], force[k], field[k], dt_s[k]), s, p)
         for i in range(4):
             out[k, i] = s.quaternion[i]

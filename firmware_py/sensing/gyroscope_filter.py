@@ -3,43 +3,44 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record
-from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, begin_filter, restart
-from firmware_py.sensing.error_state import error_state_step
+from firmware_py.records import Array, Records, field, record
+from firmware_py.sensing.attitude import restart
+from firmware_py.sensing.attitude_filter import Motion
+from firmware_py.sensing.error_state import begin_errors, error_state_step
+from firmware_py.sensing.error_state_records import ErrorStateAttitude, ErrorStateNumbers
 from firmware_py.sensing.quaternion import from_matrix
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
 
-KALMAN_MEMORY = np.dtype(
-    [
-        ("state", ATTITUDE_STATE, (1,)),
-        ("params", ATTITUDE, (1,)),
-        ("last_rate", "f8", (3,)),
-        ("rate", "f8", (3,)),
-        ("force", "f8", (3,)),
-        ("field", "f8", (3,)),
-        ("dt_s", "f8", (1,)),
-    ]
-)
-"""The filter and one sample. ``params.align_samples``: samples whose mean is the start attitude; below 1: level."""
+
+@record
+class GyroscopeMemory:
+    """The filter and one sample. ``params.align_samples``: samples whose mean is the start attitude; below 1: level."""
+
+    state: Records[ErrorStateAttitude] = field("", 1)
+    params: Records[ErrorStateNumbers] = field("", 1)
+    last_rate: Array = field("rad/s", 3)
+    rate: Array = field("rad/s", 3)
+    force: Array = field("m/s^2", 3)
+    dt_s: Array = field("s", 1)
+    field: Array = field("any", 3)
 
 
 @kernel
-def begin_gyroscope(memory: Record) -> None:
+def begin_gyroscope(memory: Records[GyroscopeMemory]) -> None:
     """Forget everything; the next samples align anew."""
     m = memory[0]
     s, p = m.state[0], m.params[0]
     restart(s)
     m.last_rate[:] = np.nan
     if p.align_samples < 1.0:
-        begin_filter(s, p, s.field)
+        begin_errors(s.field, s, p)
         s.aligned = 1
 
 
 @kernel
-def step_gyroscope(memory: Record) -> None:
+def step_gyroscope(memory: Records[GyroscopeMemory]) -> None:
     """Filter one sample, ``dt_s`` after the last: rate rad/s, force m/s^2, field of any unit (nan: none), body frame.
 
     The difference of two samples of the rate stands for the angular acceleration. Without a field the heading of the
@@ -59,9 +60,10 @@ def step_gyroscope(memory: Record) -> None:
             triad(s.sums[0], s.sums[2], s.matrix)
             from_matrix(s.matrix, s.quaternion)
             if s.samples >= p.align_samples:
-                begin_filter(s, p, s.sums[2])
+                begin_errors(s.sums[2], s, p)
                 s.aligned = 1
-        m.last_rate[:] = m.rate
+        for i in range(3):
+            m.last_rate[i] = m.rate[i]
         return
     if not m.dt_s[0] > 0.0:
         return
@@ -73,17 +75,17 @@ def step_gyroscope(memory: Record) -> None:
         m.last_rate[i] = m.rate[i]
         if seen:
             s.field[i] = m.field[i]
-    error_state_step(s, p.error_state, m.force, s.previous, s.field, seen, m.dt_s[0])
+    error_state_step(Motion(m.force, s.previous, seen, m.dt_s[0]), s, p)
 
 
 @kernel
 def run_gyroscope(
-    memory: Record,
-    rate: NDArray[np.float64],
-    force: NDArray[np.float64],
-    field: NDArray[np.float64],
-    dt_s: NDArray[np.float64],
-    out: NDArray[np.float64],
+    memory: Records[GyroscopeMemory],
+    rate: Array,
+    force: Array,
+    field: Array,
+    dt_s: Array,
+    out: Array,
 ) -> None:
     """A recording: rate, force, field (n, 3), dt_s (n,) into the attitudes ``out`` (n, 4)."""
     m = memory[0]

@@ -15,31 +15,18 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record
+from firmware_py.records import Array
+from firmware_py.sensing.attitude_filter import AttitudeFilter, Motion
+from firmware_py.sensing.attitude_params import quaternion_kalman_params
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
+from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanAttitude, QuaternionKalmanNumbers
 from firmware_py.sensing.triad import triad, triad_covariance
 from hal.compiled import kernel
 
-QUATERNION_KALMAN = np.dtype(
-    [
-        ("turn_density", "f8", (3,)),  # rad^2/s, body axes: white noise of the rate
-        ("rate_density", "f8", (3,)),  # (rad/s)^2/s: random walk of its error (Xi_alpha for accelerometers, erratum 44)
-        ("lead", "f8"),
-        ("up_density", "f8"),  # rad^2 s of the direction of gravity, the hand's accelerations included
-        ("field_density", "f8"),  # rad^2 s of the direction of the field
-        ("start_variance", "f8", (3,)),  # of tilt, heading, rate
-        ("gravity", "f8"),
-        ("force_gate_m_s2", "f8"),
-        ("field_gate", "f8"),  # relative
-    ]
-)
-QUATERNION_KALMAN_STATE = np.dtype([("covariance", "f8", (7, 7)), ("field_size", "f8"), ("rejected", "i8")])
-
 
 @kernel
-def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def tilde(q: Array, out: Array) -> None:
     """Set ``out`` (4, 3) to Q~, which satisfies Q~ B = q x (0, B) (Ang 2004 (4.13), erratum 37)."""
     out[0, 0], out[0, 1], out[0, 2] = -q[1], -q[2], -q[3]
     out[1, 0], out[1, 1], out[1, 2] = q[0], -q[3], q[2]
@@ -48,41 +35,35 @@ def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
 
 
 @kernel
-def start_quaternion_kalman(state: Record, params: Record, field_size: float) -> None:
+def begin_quaternion_kalman(field: Array, state: QuaternionKalmanAttitude, params: QuaternionKalmanNumbers) -> None:
     """Set the covariance and the start values after alignment."""
-    k = state.quaternion_kalman
+    k, numbers = state.quaternion_kalman, params.quaternion_kalman
     q = np.empty((4, 3))
     tilde(state.quaternion, q)
     angles = np.zeros((3, 3))
     for i in range(3):
-        angles[i, i] = params.start_variance[0] if i < 2 else params.start_variance[1]
+        angles[i, i] = numbers.start_variance[0] if i < 2 else numbers.start_variance[1]
     body = state.matrix.T.copy() @ angles @ state.matrix.copy()
     k.covariance[:, :] = 0.0
     k.covariance[:4, :4] = 0.25 * q @ body @ q.T
     for i in range(3):
-        k.covariance[4 + i, 4 + i] = params.start_variance[2]
-    k.field_size = field_size
+        k.covariance[4 + i, 4 + i] = numbers.start_variance[2]
+    k.field_size = 0.0
     k.rejected = 0
 
 
 @kernel
-def quaternion_kalman_step(
-    state: Record,
-    params: Record,
-    force: NDArray[np.float64],
-    alpha: NDArray[np.float64],
-    field: NDArray[np.float64],
-    dt: float,
-) -> None:
-    """Run one step of ``dt`` s; arguments as ``error_state_step``, ``field`` the last one known (body frame)."""
-    k = state.quaternion_kalman
+def quaternion_kalman_step(motion: Motion, state: QuaternionKalmanAttitude, params: QuaternionKalmanNumbers) -> None:
+    """Run one step; the field in the state is the last one known (body frame)."""
+    k, numbers = state.quaternion_kalman, params.quaternion_kalman
+    force, alpha, field, dt = motion.force, motion.alpha, state.field, motion.dt_s
     turn = np.empty(3)
     for i in range(3):
         now = alpha[i] - state.bias[i]
         before = state.rate[i]
         state.rate[i] += 0.5 * (now + state.previous[i]) * dt
         state.previous[i] = now
-        turn[i] = (before + params.lead * (state.rate[i] - before)) * dt
+        turn[i] = (before + numbers.lead * (state.rate[i] - before)) * dt
     # --- prediction: columns of Phi_Q are the turned unit quaternions
     f = np.eye(7)
     unit = np.empty(4)
@@ -112,17 +93,17 @@ def quaternion_kalman_step(
         p[:4, 4:] *= -1.0
         p[4:, :4] *= -1.0
     for n in range(3):
-        p[4 + n, 4 + n] += params.rate_density[n] * dt
+        p[4 + n, 4 + n] += numbers.rate_density[n] * dt
         for i in range(4):
             for j in range(4):
-                p[i, j] += 0.25 * dt * q[i, n] * params.turn_density[n] * q[j, n]
+                p[i, j] += 0.25 * dt * q[i, n] * numbers.turn_density[n] * q[j, n]
     # --- measurement
     size = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     strength = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
     if k.field_size == 0.0:
         k.field_size = strength
-    known = abs(strength - k.field_size) <= params.field_gate * k.field_size
-    if abs(size - params.gravity) > params.force_gate_m_s2 or strength == 0.0 or not known:
+    known = abs(strength - k.field_size) <= numbers.field_gate * k.field_size
+    if abs(size - numbers.gravity) > numbers.force_gate_m_s2 or strength == 0.0 or not known:
         k.rejected += 1
         k.covariance[:, :] = p
         to_matrix(state.quaternion, state.matrix)
@@ -132,7 +113,7 @@ def quaternion_kalman_step(
     from_matrix(state.matrix, z)
     angles = np.empty((3, 3))
     if found:
-        triad_covariance(force / size, field / strength, params.up_density / dt, params.field_density / dt, angles)
+        triad_covariance(force / size, field / strength, numbers.up_density / dt, numbers.field_density / dt, angles)
         side = z[0] * state.quaternion[0] + z[1] * state.quaternion[1]
         side += z[2] * state.quaternion[2] + z[3] * state.quaternion[3]
         residual = np.empty(4)
@@ -164,3 +145,12 @@ def quaternion_kalman_step(
             state.rate[i] -= x[4 + i]
     k.covariance[:, :] = 0.5 * (p + p.T)
     to_matrix(state.quaternion, state.matrix)
+
+
+QUATERNION_KALMAN_FILTER = AttitudeFilter(
+    QuaternionKalmanNumbers,
+    QuaternionKalmanAttitude,
+    quaternion_kalman_params,
+    begin_quaternion_kalman,
+    quaternion_kalman_step,
+)

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record
+from firmware_py.sensing.config import MOST_AXES
 from firmware_py.sensing.kinematics import observation_matrix
 from hal.compiled import kernel
+from hal.scratch import scratch_matrix
 
 
 def parity_rows(
@@ -24,27 +26,17 @@ def parity_rows(
 
 
 @kernel
-def parity(
-    readings: NDArray[np.float64],
-    rate: NDArray[np.float64],
-    kinematics: Record,
-    null: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    out: NDArray[np.float64],
-    by_rate: NDArray[np.float64],
-) -> None:
-    """``out`` (M,): what ``null`` (M, N) leaves of readings (N,) without their centripetal part; ``by_rate`` (M, 3) its
-    slope with the rate, sign turned. ``slope`` (N, 3) is work space."""
-    centripetal_slope(rate, kinematics, slope)
+def parity(readings: NDArray[np.float64], rate: NDArray[np.float64], params: Record, out: NDArray[np.float64]) -> None:
+    """Set ``out`` (M,) to what the combinations ``params.null`` (M, N) leave of readings (N,) without their centripetal
+    part."""
+    slope = scratch_matrix(MOST_AXES, 3)[: len(readings)]
+    centripetal_slope(rate, params.kinematics, slope)
     for m in range(len(out)):
         out[m] = 0.0
-        by_rate[m, 0] = by_rate[m, 1] = by_rate[m, 2] = 0.0
         for i in range(len(readings)):
             # c(omega) is of second degree without lower terms: slope omega = 2 c
             c = 0.5 * (slope[i, 0] * rate[0] + slope[i, 1] * rate[1] + slope[i, 2] * rate[2])
-            out[m] += null[m, i] * (readings[i] - c)
-            for k in range(3):
-                by_rate[m, k] += null[m, i] * slope[i, k]
+            out[m] += params.null[m, i] * (readings[i] - c)
 
 
 @kernel

@@ -25,15 +25,8 @@ from firmware_py.frame import (
     TIP_ACCELERATION,
     TIP_DISPLACEMENT,
 )
-from firmware_py.records import Record, attributes, copy_record, new_record
-from firmware_py.sensing.attitude import (
-    ATTITUDE,
-    ATTITUDE_STATE,
-    align,
-    attitude_params,
-    restart,
-    step_attitude,
-)
+from firmware_py.records import Record, copy_record, new_record
+from firmware_py.sensing.attitude import align, attitude_params, attitude_state, restart, step_attitude
 from firmware_py.sensing.attitude_params import quiet_point
 from firmware_py.sensing.calibration import (
     calibrate,
@@ -41,7 +34,7 @@ from firmware_py.sensing.calibration import (
     calibration_dtype,
     calibration_params,
 )
-from firmware_py.sensing.config import MOST_AXES, SensingConfig
+from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, plausible_rate, solve_motion
 from firmware_py.sensing.leave_out import leave_out
 from firmware_py.sensing.numeric_kinematics import solve_guarded, solve_numeric
@@ -55,7 +48,7 @@ from firmware_py.sensing.translation import (
     translation_params,
 )
 from hal.compiled import kernel
-from hal.scratch import scratch, scratch_matrix
+from hal.scratch import scratch
 from hal.types import STANDARD_GRAVITY
 
 GUARD = 0.1
@@ -65,13 +58,13 @@ LEAN_CORNER_HZ = 0.3
 """Corrections of the attitude slower than this reach the tip's gravity."""
 
 
-def sense_dtype(n: int) -> np.dtype[Any]:
-    """Numbers of the stage with ``n`` axes."""
+def sense_dtype(n: int, attitude: np.dtype[Any]) -> np.dtype[Any]:
+    """Numbers of the stage with ``n`` axes and the ``attitude`` of the chosen filter."""
     return np.dtype(
         [
             ("calibration", calibration_dtype(n)),
             ("kinematics", kinematics_dtype(n)),
-            ("attitude", ATTITUDE),
+            ("attitude", attitude),
             ("translation", TRANSLATION),
             ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
             ("lean_sections", "f8", (2, 5)),
@@ -84,11 +77,11 @@ def sense_dtype(n: int) -> np.dtype[Any]:
     )
 
 
-def sense_state_dtype(n: int) -> np.dtype[Any]:
-    """State of the stage with ``n`` axes."""
+def sense_state_dtype(n: int, attitude: np.dtype[Any]) -> np.dtype[Any]:
+    """State of the stage with ``n`` axes and the ``attitude`` of the chosen filter."""
     return np.dtype(
         [
-            ("attitude", ATTITUDE_STATE),
+            ("attitude", attitude),
             ("smoothed", "f8", (2,)),  # supply V, temperature degC
             ("readings", "f8", (n,)),
             ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
@@ -108,13 +101,14 @@ def sense_params(config: SensingConfig) -> Record:
     noise = 1e-6 * STANDARD_GRAVITY * np.array(config.noise_ug_per_rtHz) * (0.25 * config.cutoff_rad_s) ** 0.5
     null = np.zeros((len(PARITIES), n))
     null[: n - 6] = parity_rows(places, axes, noise)
+    attitude = attitude_params(config)
     return new_record(
-        sense_dtype(n),
+        sense_dtype(n, attitude.dtype),
         parities=n - 6,
         null=null,
         calibration=calibration_params(config),
         kinematics=kinematic_params(places, axes, np.array(config.noise_ug_per_rtHz)),
-        attitude=attitude_params(config),
+        attitude=attitude,
         translation=translation_params(config),
         quiet_point=quiet_point(config)[0],
         lean_sections=integrator_sections(config.tick_hz, LEAN_CORNER_HZ),
@@ -124,11 +118,11 @@ def sense_params(config: SensingConfig) -> Record:
     )
 
 
-def sense_state(axes: int) -> Record:
+def sense_state(config: SensingConfig) -> Record:
     """Return the state before the first sample (``sense_state_dtype``)."""
-    state = new_record(sense_state_dtype(axes), smoothed=np.nan, last_tick=np.nan)
-    restart(attributes(state)[0].attitude)
-    return state
+    attitude = attitude_state(config)
+    dtype = sense_state_dtype(len(config.channels), attitude.dtype)
+    return new_record(dtype, attitude=attitude, smoothed=np.nan, last_tick=np.nan)
 
 
 @kernel
@@ -139,7 +133,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
     corrections are one more angular acceleration; its band integral is the turn to take back.
     """
     attitude = state.attitude
-    corrected = attitude.error_state.corrected
+    corrected = attitude.corrected
     dt = param.attitude.dt_s
     sudden, turn = scratch(3), scratch(3)
     for i in range(3):
@@ -155,9 +149,8 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
 @kernel
 def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> None:
     """Write the parity residuals of the axes beyond six into the frame."""
-    n = len(state.readings)
-    slope, left, by_rate = scratch_matrix(MOST_AXES, 3)[:n], scratch(N_PARITIES), scratch_matrix(N_PARITIES, 3)
-    parity(state.readings, state.attitude.rate, param.kinematics, param.null, slope, left, by_rate)
+    left = scratch(N_PARITIES)
+    parity(state.readings, state.attitude.rate, param, left)
     for m in range(param.parities):
         frame[PARITY + m] = left[m]
 
@@ -213,7 +206,8 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     else:
         felt = scratch(6)
         point_force(motion, attitude.bias, attitude.rate, param.quiet_point, felt[:3])
-        felt[3:] = motion[3:]
+        for i in range(3, 6):
+            felt[i] = motion[i]
         step_attitude(attitude, param.attitude, felt, field, fresh, steps)
     tip = frame[TIP_ACCELERATION : TIP_ACCELERATION + 3]
     if status & ALIGNING:
@@ -238,7 +232,7 @@ class Sensing:
     def __init__(self, config: SensingConfig) -> None:
         self.config = config
         self.params = sense_params(config)
-        self.state = sense_state(len(config.channels))
+        self.state = sense_state(config)
 
     def step(self, frame: NDArray[np.float64]) -> None:
         sense_kernel(frame, self.state, self.params)
@@ -254,4 +248,4 @@ class Sensing:
 
     def reset(self) -> None:
         """Restore the state before the first sample."""
-        copy_record(self.state, sense_state(len(self.config.channels)))
+        copy_record(self.state, sense_state(self.config))

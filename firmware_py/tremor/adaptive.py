@@ -16,124 +16,129 @@ over that of what is no tremor. Each row of the regression counts for the two le
 from __future__ import annotations
 
 from math import exp, sqrt
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record, new_record
-from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, AdaptiveDesign, design_adaptive
+from firmware_py.records import Array, Records, field, new, record
+from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, design_adaptive
 from firmware_py.tremor.config import TremorConfig
-from hal.compiled import kernel
-
-Array = NDArray[np.float64]
-
-
-def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
-    m, n, slow, taps = design.bank.size, len(design.bank.pole), len(design.bank.slow), design.taps.shape[1]
-    channels = design.bank.channels
-    return np.dtype(
-        [
-            ("pole_re", "f8", (n,)),
-            ("pole_im", "f8", (n,)),
-            ("pole_gain", "f8", (n,)),
-            ("slow", "f8", (slow,)),
-            ("taps", "f8", (OUTPUTS, taps)),
-            ("weight", "f8", (5,)),
-            ("gate", "f8", (5,)),
-            ("gate_power", "f8", (AXES,)),
-            ("gate_smoothing", "f8"),
-            ("tremor", "f8", (LEVELS, m, m)),
-            ("rest", "f8", (AXES, m, m)),
-            ("quiet", "f8", (AXES, m, m)),
-            ("cross", "f8", (LEVELS, OUTPUTS, m)),
-            ("noise_cross", "f8", (AXES, OUTPUTS, m)),
-            ("noise_power", "f8", (AXES,)),
-            ("lean_by_up", "f8", (AXES, channels, 3)),
-            ("lean_by_square", "f8", (AXES, 3, 3)),
-            ("lean_cross", "f8", (2, OUTPUTS, design.bank.one)),
-            ("lean_power", "f8", (2,)),
-            ("weighted_power", "f8", (LEVELS,)),
-            ("least_power", "f8"),
-            ("start", "f8", (AXES, LEVELS, OUTPUTS, m)),
-            ("onward", "f8", (AXES, channels, m)),
-            ("block_ticks", "i8"),
-            ("keep", "f8"),
-            ("prior_blocks", "f8", (LEVELS,)),
-            ("share", "f8", (AXES, AXES)),  # what the first axis takes from the second
-            ("outlier", "f8"),
-            ("ease", "f8"),  # share of the way to the solved filter in one tick
-            # through the tremor band's filter, where errors are counted relative to the motion
-            ("relative", "f8"),
-            ("core_weight", "f8", (5,)),
-            ("core_tremor", "f8", (LEVELS, m, m)),
-            ("core_rest", "f8", (AXES, m, m)),
-            ("core_cross", "f8", (LEVELS, OUTPUTS, m)),
-            ("core_noise_cross", "f8", (AXES, OUTPUTS, m)),
-            ("core_noise_power", "f8", (AXES,)),
-            ("core_lean_cross", "f8", (2, OUTPUTS, design.bank.one)),
-            ("core_lean_power", "f8", (2,)),
-            ("core_weighted_power", "f8", (LEVELS,)),
-            ("core_least_power", "f8"),
-        ]
-    )
+from firmware_py.tremor.family import EstimatorParams, EstimatorState, Family, Samples
+from hal.compiled import inlined_kernel, kernel
 
 
-def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
-    m, taps, channels = design.bank.size, design.taps.shape[1], design.bank.channels
-    return np.dtype(
-        [
-            ("bank", "f8", (AXES, m)),
-            ("pending", "f8", (AXES, channels)),  # the samples that the bank holds for this tick, measured or predicted
-            ("running", "i8"),
-            ("weigh", "f8", (AXES, channels, 2)),
-            ("weighted", "f8", (AXES, m)),
-            ("gate", "f8", (AXES, 2)),
-            ("gate_power", "f8", (AXES,)),
-            ("burst", "f8", (AXES,)),  # share of the burst's filter
-            ("sum", "f8", (AXES,)),
-            ("in_block", "i8"),
-            ("blocks", "f8", (AXES, taps)),  # ring of block means
-            ("snapshots", "f8", (AXES, taps // 2 + 1, m)),  # ring of bank states at the ends of blocks
-            ("bursts", "f8", (AXES, taps // 2 + 1)),  # ring of ``burst`` at the ends of blocks
-            ("n_blocks", "i8"),
-            ("normal", "f8", (AXES, LEVELS, m, m)),  # lower triangles
-            ("right", "f8", (AXES, LEVELS, OUTPUTS, m)),
-            ("power", "f8", (AXES, LEVELS)),
-            ("count", "f8", (AXES, LEVELS)),
-            ("filter", "f8", (AXES, LEVELS, OUTPUTS, m)),
-            ("solved", "f8", (AXES, LEVELS, OUTPUTS, m)),  # where ``filter`` goes
-            ("work", "f8", (m, m)),
-            ("scale", "f8", (m,)),
-            # the sensors' noise in learning, for the present ``up`` (body)
-            ("up", "f8", (3,)),
-            ("noise_cross", "f8", (AXES, OUTPUTS, m)),
-            ("noise_power", "f8", (AXES,)),
-            ("core_noise_cross", "f8", (AXES, OUTPUTS, m)),
-            ("core_noise_power", "f8", (AXES,)),
-            ("target", "f8", (OUTPUTS,)),
-            ("solution", "f8", (OUTPUTS, m)),
-            # the regression's sums through the tremor band's filter
-            ("core_weigh", "f8", (AXES, channels, 2)),
-            ("core_weighted", "f8", (AXES, m)),
-            ("core_sum", "f8", (AXES,)),
-            ("core_blocks", "f8", (AXES, taps)),
-            ("core_snapshots", "f8", (AXES, taps // 2 + 1, m)),
-            ("core_normal", "f8", (AXES, LEVELS, m, m)),
-            ("core_right", "f8", (AXES, LEVELS, OUTPUTS, m)),
-            ("core_power", "f8", (AXES, LEVELS)),
-            ("row_weight", "f8", (LEVELS,)),
-        ]
-    )
+@record
+class AdaptiveParams:
+    """The design's numbers (``adaptive_design``). ``m`` are the states of an axis' filter bank, ``poles`` and ``slows``
+    those of a channel; ``core_`` are the same through the tremor band's filter."""
+
+    pole_re: Array = field("1", "poles")
+    pole_im: Array = field("1", "poles")
+    pole_gain: Array = field("1", "poles")
+    slow: Array = field("1", "slows")
+    taps: Array = field("1", OUTPUTS, "taps")
+    weight: Array = field("1", 5)
+    gate: Array = field("1", 5)
+    gate_power: Array = field("sample^2", AXES)
+    gate_smoothing: float = field("1")
+    tremor: Array = field("sample^2/m^2", LEVELS, "m", "m")
+    rest: Array = field("sample^2", AXES, "m", "m")
+    quiet: Array = field("sample^2", AXES, "m", "m")
+    cross: Array = field("sample/m", LEVELS, OUTPUTS, "m")
+    noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
+    noise_power: Array = field("m^2", AXES)
+    lean_by_up: Array = field("1", AXES, "channels", 3)
+    lean_by_square: Array = field("1", AXES, 3, 3)
+    lean_cross: Array = field("sample m", 2, OUTPUTS, "one")
+    lean_power: Array = field("m^2", 2)
+    weighted_power: Array = field("m^2", LEVELS)
+    least_power: float = field("m^2")
+    start: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")
+    onward: Array = field("1", AXES, "channels", "m")
+    block_ticks: int = field("1")
+    keep: float = field("1")
+    prior_blocks: Array = field("1", LEVELS)
+    share: Array = field("1", AXES, AXES)  # what the first axis takes from the second
+    outlier: float = field("1")
+    ease: float = field("1")  # share of the way to the solved filter in one tick
+    relative: float = field("1")
+    core_weight: Array = field("1", 5)
+    core_tremor: Array = field("sample^2/m^2", LEVELS, "m", "m")
+    core_rest: Array = field("sample^2", AXES, "m", "m")
+    core_cross: Array = field("sample/m", LEVELS, OUTPUTS, "m")
+    core_noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
+    core_noise_power: Array = field("m^2", AXES)
+    core_lean_cross: Array = field("sample m", 2, OUTPUTS, "one")
+    core_lean_power: Array = field("m^2", 2)
+    core_weighted_power: Array = field("m^2", LEVELS)
+    core_least_power: float = field("m^2")
 
 
-def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) -> Record:
+@record
+class AdaptiveState:
+    """The filter banks, what the regression has summed, and the filters in use."""
+
+    bank: Array = field("sample", AXES, "m")
+    pending: Array = field("sample", AXES, "channels")  # that the bank holds for this tick, measured or predicted
+    running: int = field("1")
+    weigh: Array = field("sample", AXES, "channels", 2)
+    weighted: Array = field("sample", AXES, "m")
+    gate: Array = field("sample", AXES, 2)
+    gate_power: Array = field("sample^2", AXES)
+    burst: Array = field("1", AXES)  # share of the burst's filter
+    sum: Array = field("sample", AXES)
+    in_block: int = field("1")
+    blocks: Array = field("sample", AXES, "taps")  # ring of block means
+    snapshots: Array = field("sample", AXES, "lags", "m")  # ring of bank states at the ends of blocks
+    bursts: Array = field("1", AXES, "lags")  # ring of ``burst`` at the ends of blocks
+    n_blocks: int = field("1")
+    normal: Array = field("sample^2", AXES, LEVELS, "m", "m")  # lower triangles
+    right: Array = field("sample m", AXES, LEVELS, OUTPUTS, "m")
+    power: Array = field("m^2", AXES, LEVELS)
+    count: Array = field("1", AXES, LEVELS)
+    filter: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")
+    solved: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")  # where ``filter`` goes
+    work: Array = field("sample^2", "m", "m")
+    scale: Array = field("1/sample", "m")
+    up: Array = field("1", 3)  # body frame; the four below are the sensors' noise in learning for it
+    noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
+    noise_power: Array = field("m^2", AXES)
+    core_noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
+    core_noise_power: Array = field("m^2", AXES)
+    target: Array = field("m", OUTPUTS)
+    solution: Array = field("sample m", OUTPUTS, "m")
+    core_weigh: Array = field("sample", AXES, "channels", 2)  # from here on: through the tremor band's filter
+    core_weighted: Array = field("sample", AXES, "m")
+    core_sum: Array = field("sample", AXES)
+    core_blocks: Array = field("sample", AXES, "taps")
+    core_snapshots: Array = field("sample", AXES, "lags", "m")
+    core_normal: Array = field("sample^2", AXES, LEVELS, "m", "m")
+    core_right: Array = field("sample m", AXES, LEVELS, OUTPUTS, "m")
+    core_power: Array = field("m^2", AXES, LEVELS)
+    row_weight: Array = field("1", LEVELS)
+
+
+@record
+class AdaptiveEstimator(EstimatorState):
+    """The estimator's state with the adaptive method."""
+
+    adaptive: AdaptiveState = field("")
+
+
+@record
+class AdaptiveNumbers(EstimatorParams):
+    """The estimator's parameters with the adaptive method."""
+
+    adaptive: AdaptiveParams = field("")
+
+
+def adaptive_params(config: TremorConfig) -> Records[AdaptiveParams]:
     """Return the kernels' parameters."""
-    d = design or design_adaptive(config)
+    d = design_adaptive(config)
     a = config.adaptive
     block_s = d.block_ticks / config.tick_hz
-    return new_record(
-        adaptive_dtype(d),
+    return new(
+        AdaptiveParams,
         pole_re=d.bank.pole.real,
         pole_im=d.bank.pole.imag,
         pole_gain=1.0 - np.abs(d.bank.pole),
@@ -175,10 +180,14 @@ def _shares(config: TremorConfig) -> Array:
     return config.adaptive.share * alike * (1.0 - np.eye(AXES)) + np.eye(AXES)
 
 
-def adaptive_state(design: AdaptiveDesign) -> Record:
+def adaptive_state(config: TremorConfig) -> Records[AdaptiveState]:
     """Return the state before the first sample, which holds the prior hands' filters."""
-    return new_record(
-        adaptive_state_dtype(design),
+    design = design_adaptive(config)
+    taps = design.taps.shape[1]
+    sizes = {"channels": design.bank.channels, "taps": taps, "lags": taps // 2 + 1}
+    return new(
+        AdaptiveState,
+        sizes,
         filter=design.start,
         solved=design.start,
         noise_cross=design.noise_cross,
@@ -189,7 +198,7 @@ def adaptive_state(design: AdaptiveDesign) -> Record:
 
 
 @kernel
-def bank_turn(bank: Array, params: Record) -> None:
+def bank_turn(bank: Array, params: AdaptiveParams) -> None:
     """Advance ``bank`` (m,) by one tick without its inputs."""
     n = len(params.pole_re)
     slow = len(params.slow)
@@ -204,7 +213,7 @@ def bank_turn(bank: Array, params: Record) -> None:
 
 
 @kernel
-def bank_add(bank: Array, channel: int, sample: float, params: Record) -> None:
+def bank_add(bank: Array, channel: int, sample: float, params: AdaptiveParams) -> None:
     """Add a channel's input of one tick to the bank, after ``bank_turn``."""
     n = len(params.pole_re)
     slow = len(params.slow)
@@ -217,8 +226,9 @@ def bank_add(bank: Array, channel: int, sample: float, params: Record) -> None:
 
 
 @kernel
-def adaptive_predict(state: Record, params: Record) -> None:
+def adaptive_tick(coasts: bool, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
     """Advance to the next tick: learn from the last tick's data, and run the bank on with predicted samples."""
+    state, params = states.adaptive, param.adaptive
     if state.running:
         _learn(state, params)
         _ease(state, params)
@@ -237,17 +247,27 @@ def adaptive_predict(state: Record, params: Record) -> None:
 
 
 @kernel
-def adaptive_correct(state: Record, axis: int, sample: float, turned: Array, params: Record) -> None:
+def adaptive_sample(samples: Samples, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
     """Replace the predicted samples by the tick's own: of the tip, and the lever's (``LeverConfig``)."""
-    for c in range(params.onward.shape[1]):
-        own = turned[c - 1] if c else sample
-        bank_add(state.bank[axis], c, own - state.pending[axis, c], params)
-        state.pending[axis, c] = own
+    state, params = states.adaptive, param.adaptive
+    for i in range(3):
+        state.up[i] = samples.up[i]
+    for axis in range(AXES):
+        for c in range(params.onward.shape[1]):
+            own = samples.turned[axis, c - 1] if c else samples.tip[axis]
+            bank_add(state.bank[axis], c, own - state.pending[axis, c], params)
+            state.pending[axis, c] = own
 
 
 @kernel
-def adaptive_output(state: Record, axis: int, output: int) -> float:
-    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay; 2: the core band's part of 1."""
+def adaptive_output(axis: int, states: AdaptiveEstimator, param: AdaptiveNumbers) -> tuple[float, float, float]:
+    """Return the tremor now and over the loop's delay, and the core band's part of the latter, m."""
+    state = states.adaptive
+    return _filtered(state, axis, 0), _filtered(state, axis, 1), _filtered(state, axis, 2)
+
+
+@kernel
+def _filtered(state: AdaptiveState, axis: int, output: int) -> float:
     calm, burst = 0.0, 0.0
     bank = state.bank[axis]
     for j in range(len(bank)):
@@ -265,8 +285,8 @@ def biquad_step(sample: float, memory: Array, c: Array) -> float:
     return out
 
 
-@kernel
-def _learn(state: Record, params: Record) -> None:
+@inlined_kernel
+def _learn(state: AdaptiveState, params: AdaptiveParams) -> None:
     """Weighted bank and block sums take the last sample; at the end of a block the regression takes its row."""
     for i in range(AXES):
         sample = state.pending[i, 0]
@@ -297,12 +317,16 @@ def _learn(state: Record, params: Record) -> None:
     for i in range(AXES):
         state.blocks[i, at % n_taps] = state.sum[i] / params.block_ticks
         state.sum[i] = 0.0
-        state.snapshots[i, at % (lag + 1), :] = state.weighted[i]
+        snapshot = state.snapshots[i, at % (lag + 1)]
+        for j in range(len(snapshot)):
+            snapshot[j] = state.weighted[i, j]
         state.bursts[i, at % (lag + 1)] = state.burst[i]
         if params.relative > 0.0:
             state.core_blocks[i, at % n_taps] = state.core_sum[i] / params.block_ticks
             state.core_sum[i] = 0.0
-            state.core_snapshots[i, at % (lag + 1), :] = state.core_weighted[i]
+            snapshot = state.core_snapshots[i, at % (lag + 1)]
+            for j in range(len(snapshot)):
+                snapshot[j] = state.core_weighted[i, j]
         # the bank must have forgotten its start: a target's length more than the target itself
         if at >= 2 * n_taps:
             _regress(state, i, at, params)
@@ -314,7 +338,7 @@ def _learn(state: Record, params: Record) -> None:
 
 
 @kernel
-def _know_noise(state: Record, params: Record) -> None:
+def _know_noise(state: AdaptiveState, params: AdaptiveParams) -> None:
     """Set the noise's share in learning for the present attitude: gravity carries that of the turns into the tip's."""
     channels, one = params.onward.shape[1], params.lean_cross.shape[2]
     for i in range(AXES):
@@ -343,7 +367,7 @@ def _know_noise(state: Record, params: Record) -> None:
 
 
 @kernel
-def _ease(state: Record, params: Record) -> None:
+def _ease(state: AdaptiveState, params: AdaptiveParams) -> None:
     """Let the filters in use approach the solved ones: at once, they would step the tip at every solution."""
     for axis in range(AXES):
         for level in range(LEVELS):
@@ -377,7 +401,7 @@ def _add_row(normal: Array, right: Array, phi: Array, target: Array, weight: flo
 
 
 @kernel
-def _regress(state: Record, axis: int, at: int, params: Record) -> None:
+def _regress(state: AdaptiveState, axis: int, at: int, params: AdaptiveParams) -> None:
     """Fill one row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
     lag = state.blocks.shape[1] // 2
     target = state.target
@@ -402,7 +426,9 @@ def _regress(state: Record, axis: int, at: int, params: Record) -> None:
 
 
 @kernel
-def _row_weight(state: Record, axis: int, level: int, now2: float, burst: float, params: Record) -> float:
+def _row_weight(
+    state: AdaptiveState, axis: int, level: int, now2: float, burst: float, params: AdaptiveParams
+) -> float:
     """Return how much a row counts for ``level``: a jerk must not outvote the tremor."""
     n0 = params.prior_blocks[level]
     known = n0 * params.weighted_power[level] + state.power[axis, level]
@@ -411,15 +437,24 @@ def _row_weight(state: Record, axis: int, level: int, now2: float, burst: float,
     return weight * min(1.0, params.outlier * typical / max(now2, 1e-300))
 
 
+class _Rows(NamedTuple):
+    """The sums of an axis' regression, with the rest and the noise of its prior."""
+
+    normal: Array
+    right: Array
+    rest: Array
+    noise: Array
+    weight: float
+    power: float
+
+
 @kernel
-def _take(
-    state: Record, normal: Array, right: Array, rest: Array, noise: Array, count: float, power: float, share: float,
-    own: float,
-) -> None:  # fmt: skip
+def _take(rows: _Rows, share: float, own: float, state: AdaptiveState) -> None:
     """Add ``share`` of an axis' rows to the system, scaled down to the power ``own`` (m^2) a row.
 
     What is scaled down has too little noise in it for the smaller tremor: the rest is put back.
     """
+    normal, right, rest, noise, count, power = rows
     if count <= 0.0 or power <= 0.0:
         return
     ratio = min(1.0, own * count / power)
@@ -432,7 +467,7 @@ def _take(
 
 
 @kernel
-def _mean_power(state: Record, axis: int, level: int, params: Record) -> float:
+def _mean_power(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> float:
     """Return the mean square of the tremor, m^2, as the regression weighs it, noise taken off."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
     known = state.power[axis, level] + n0 * params.weighted_power[level] - state.noise_power[axis] * count
@@ -440,7 +475,7 @@ def _mean_power(state: Record, axis: int, level: int, params: Record) -> float:
 
 
 @kernel
-def _mean_core_power(state: Record, axis: int, level: int, params: Record) -> float:
+def _mean_core_power(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> float:
     """Return the same behind the tremor band's filter."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
     known = (
@@ -450,7 +485,7 @@ def _mean_core_power(state: Record, axis: int, level: int, params: Record) -> fl
 
 
 @kernel
-def _solve(state: Record, axis: int, level: int, params: Record) -> None:
+def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> None:
     """(data + prior) filter = (data + prior) cross: Cholesky of the scaled matrix, in place."""
     a, right = state.work, state.solution
     m = len(a)
@@ -476,11 +511,11 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
     for other in range(AXES):
         share = params.share[axis, other]
         if share > 0.0:
-            _take(
-                state, state.normal[other, level], state.right[other, level], params.rest[other],
-                state.noise_cross[other], state.count[other, level], state.power[other, level], share,
-                1e300 if other == axis else power,
+            part = _Rows(
+                state.normal[other, level], state.right[other, level], params.rest[other], state.noise_cross[other],
+                state.count[other, level], state.power[other, level],
             )  # fmt: skip
+            _take(part, share, 1e300 if other == axis else power, state)
     if params.relative > 0.0:
         counts = params.relative * wider
         power = _mean_core_power(state, axis, level, params)
@@ -492,11 +527,11 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
         for other in range(AXES):
             share = counts * params.share[axis, other]
             if share > 0.0:
-                _take(
-                    state, state.core_normal[other, level], state.core_right[other, level], params.core_rest[other],
-                    state.core_noise_cross[other], state.count[other, level], state.core_power[other, level], share,
-                    1e300 if other == axis else power,
+                part = _Rows(
+                    state.core_normal[other, level], state.core_right[other, level], params.core_rest[other],
+                    state.core_noise_cross[other], state.count[other, level], state.core_power[other, level],
                 )  # fmt: skip
+                _take(part, share, 1e300 if other == axis else power, state)
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])
@@ -528,3 +563,8 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
             x[i] = total / a[i, i]
         for i in range(m):
             state.solved[axis, level, o, i] = x[i] * scale[i]
+
+
+ADAPTIVE = Family(
+    AdaptiveNumbers, AdaptiveEstimator, adaptive_params, adaptive_state, adaptive_tick, adaptive_sample, adaptive_output
+)

@@ -399,7 +399,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     first = of_axis(0)
     axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
     core_b, core_a = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
-    core = _core_design(config, s, (core_b, core_a), plain, target, wanted, moving)
+    core = _core_design(config, s, (core_b, core_a), plain=plain, target=target, wanted=wanted, moving=moving)
     lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
     found = AdaptiveDesign(
         bank=bank,
@@ -432,6 +432,7 @@ def _core_design(
     config: TremorConfig,
     s: _Spectra,
     peak: tuple[Array, Array],
+    *,
     plain: Complex,
     target: Complex,
     wanted: list[Array],

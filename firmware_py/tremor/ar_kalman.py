@@ -8,20 +8,17 @@ present value from values one horizon older (direct multi-step, no iterated erro
 from __future__ import annotations
 
 from math import pi, sqrt
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Integers, Records, field, new, record
 from firmware_py.sensing.translation import integrator_sections
 from firmware_py.tremor.adaptive_design import sensor_response
 from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
 from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
-AXES = 3
 OUTPUTS = 2
 SECTIONS = 5
 RING_S = 0.5  # of the longest horizon (one period at 7 Hz and the loop) and the regressor
@@ -50,40 +47,52 @@ def horizons(config: TremorConfig) -> tuple[int, int]:
     return round(lag_s * config.tick_hz), round((lag_s + config.loop_delay_s) * config.tick_hz)
 
 
-AR = np.dtype(
-    [
-        ("sections", "f8", (SECTIONS, 5)),
-        ("scale", "f8"),
-        ("horizon", "i8", (OUTPUTS,)),
-        ("spacing", "i8"),
-        ("walk2", "f8"),
-        ("noise2", "f8"),
-        ("smoothing", "f8"),
-    ]
-)
+@record
+class ArParams:
+    """Numbers of the predictors."""
+
+    sections: Array = field("1", SECTIONS, 5)
+    scale: float = field("1")
+    horizon: Integers = field("1", OUTPUTS)
+    spacing: int = field("1")
+    walk2: float = field("1")
+    noise2: float = field("1")
+    smoothing: float = field("1")
 
 
-def ar_state_dtype(config: TremorConfig) -> np.dtype[Any]:
-    p = config.ar.order
-    return np.dtype(
-        [
-            ("memory", "f8", (AXES, SECTIONS, 2)),
-            ("past", "f8", (AXES, round(RING_S * config.tick_hz))),
-            ("power", "f8", (AXES,)),
-            ("weights", "f8", (AXES, OUTPUTS, p)),
-            ("covariance", "f8", (AXES, OUTPUTS, p, p)),
-            ("gain", "f8", (p,)),
-            ("regressor", "f8", (p,)),
-            ("at", "i8"),
-        ]
-    )
+@record
+class ArState:
+    """The band-passed past, and what each predictor has learned from it."""
+
+    memory: Array = field("m", AXES, SECTIONS, 2)
+    past: Array = field("m", AXES, "ring")
+    power: Array = field("m^2", AXES)
+    weights: Array = field("1", AXES, OUTPUTS, "order")
+    covariance: Array = field("1", AXES, OUTPUTS, "order", "order")
+    gain: Array = field("1", "order")
+    regressor: Array = field("m", "order")
+    at: int = field("1")
 
 
-def ar_params(config: TremorConfig) -> Record:
+@record
+class ArEstimator(EstimatorState):
+    """The estimator's state with the predictors'."""
+
+    ar: ArState = field("")
+
+
+@record
+class ArNumbers(EstimatorParams):
+    """The estimator's parameters with the predictors'."""
+
+    ar: ArParams = field("")
+
+
+def ar_params(config: TremorConfig) -> Records[ArParams]:
     """Return the kernels' parameters."""
     gain, _ = chain_gain_and_lag(config)
-    return new_record(
-        AR,
+    return new(
+        ArParams,
         sections=chain_sections(config),
         scale=1.0 / gain,
         horizon=horizons(config),
@@ -94,14 +103,16 @@ def ar_params(config: TremorConfig) -> Record:
     )
 
 
-def ar_state(config: TremorConfig) -> Record:
+def ar_state(config: TremorConfig) -> Records[ArState]:
     """Return the state before the first sample. The first guess of each predictor is zero."""
-    return new_record(ar_state_dtype(config), covariance=np.eye(config.ar.order))
+    sizes = {"ring": round(RING_S * config.tick_hz), "order": config.ar.order}
+    return new(ArState, sizes, covariance=np.eye(config.ar.order))
 
 
 @kernel
-def ar_coast(state: Record) -> None:
+def ar_tick(coasts: bool, states: ArEstimator, param: ArNumbers) -> None:
     """Advance one tick without a sample. The last prediction of the present stands in for it."""
+    state = states.ar
     ring = state.past.shape[1]
     before = state.at
     state.at = (before + 1) % ring
@@ -110,8 +121,8 @@ def ar_coast(state: Record) -> None:
 
 
 @kernel
-def ar_correct(state: Record, axis: int, sample: float, params: Record) -> None:
-    """Process the present tick's sample, after ``ar_coast``: run the filters, then let both predictors learn."""
+def _correct(state: ArState, axis: int, sample: float, params: ArParams) -> None:
+    """Process the present tick's sample, after ``ar_tick``: run the filters, then let both predictors learn."""
     x = prefilter_step(sample, state.memory[axis], params.sections)
     state.past[axis, state.at] = x
     state.power[axis] += params.smoothing * (x * x - state.power[axis])
@@ -142,17 +153,33 @@ def ar_correct(state: Record, axis: int, sample: float, params: Record) -> None:
 
 
 @kernel
-def _regressor(state: Record, axis: int, back: int, spacing: int) -> None:
+def _regressor(state: ArState, axis: int, back: int, spacing: int) -> None:
     ring = state.past.shape[1]
     for i in range(len(state.regressor)):
         state.regressor[i] = state.past[axis, (state.at - back - i * spacing) % ring]
 
 
 @kernel
-def ar_output(state: Record, axis: int, output: int, params: Record) -> float:
-    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay."""
+def _predicted(state: ArState, axis: int, output: int, params: ArParams) -> float:
     _regressor(state, axis, 0, params.spacing)
     total = 0.0
     for i in range(len(state.regressor)):
         total += state.weights[axis, output, i] * state.regressor[i]
     return total * params.scale
+
+
+@kernel
+def ar_sample(samples: Samples, states: ArEstimator, param: ArNumbers) -> None:
+    """Process the samples of the present tick."""
+    for i in range(AXES):
+        _correct(states.ar, i, samples.tip[i], param.ar)
+
+
+@kernel
+def ar_output(axis: int, states: ArEstimator, param: ArNumbers) -> tuple[float, float, float]:
+    """Return the tremor now and over the loop's delay, twice, m."""
+    ahead = _predicted(states.ar, axis, 1, param.ar)
+    return _predicted(states.ar, axis, 0, param.ar), ahead, ahead
+
+
+AUTOREGRESSIVE = Family(ArNumbers, ArEstimator, ar_params, ar_state, ar_tick, ar_sample, ar_output)

@@ -9,19 +9,16 @@ from __future__ import annotations
 
 from cmath import exp as cexp
 from math import exp, pi
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Complexes, Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
-from firmware_py.tremor.seen import SEEN, seen_params, undo
+from firmware_py.tremor.seen import Seen, seen_params, undo
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
-AXES = 3
 FOLLOW_TICKS = 50  # the band of E-BMFLC moves this often
 
 
@@ -30,48 +27,60 @@ def comb_size(config: TremorConfig) -> int:
     return int((config.bmflc.high_hz - config.bmflc.low_hz) / config.bmflc.step_hz + 1.0 + 1e-9)
 
 
-def bmflc_dtype(size: int) -> np.dtype[Any]:
-    return np.dtype(
-        [
-            ("seen", SEEN),
-            ("sections", "f8", (3, 5)),
-            ("behind_prefilter", "i8"),
-            ("omega", "f8", (size,)),  # rad per sample
-            ("gain", "f8"),
-            ("bias_gain", "f8"),
-            ("keep", "f8"),
-            ("follow", "f8"),  # of the centroid, per FOLLOW_TICKS; 0: the band stays
-            ("kalman", "i8"),
-            ("walk2", "f8"),
-            ("bias_walk2", "f8"),
-        ]
-    )
+@record
+class BmflcParams:
+    """Numbers of the comb."""
+
+    seen: Seen = field("")
+    sections: Array = field("1", 3, 5)
+    behind_prefilter: int = field("1")
+    omega: Array = field("rad/sample", "size")
+    gain: float = field("1")
+    bias_gain: float = field("1")
+    keep: float = field("1")
+    follow: float = field("1")  # of the centroid, per FOLLOW_TICKS; 0: the band stays
+    kalman: int = field("1")
+    walk2: float = field("1")
+    bias_walk2: float = field("1")
 
 
-def bmflc_state_dtype(size: int) -> np.dtype[Any]:
-    return np.dtype(
-        [
-            ("memory", "f8", (AXES, 3, 2)),
-            ("phasor", "c16", (AXES, size)),
-            ("turn", "c16", (AXES, size)),  # of the phasor, per sample
-            ("undo", "c16", (AXES, 2, size)),  # now, ahead
-            ("shift", "f8", (AXES,)),  # of the band, rad per sample
-            ("weights", "f8", (AXES, 2 * size + 1)),  # sine, cosine of each frequency; bias
-            ("regressor", "f8", (2 * size + 1,)),
-            ("covariance", "f8", (2 * size + 1, 2 * size + 1)),
-            ("kalman_gain", "f8", (2 * size + 1,)),
-            ("ticks", "i8"),
-        ]
-    )
+@record
+class BmflcState:
+    """Phasors and weights of each axis. ``weights``: sine, cosine of each frequency; bias."""
+
+    memory: Array = field("sample", AXES, 3, 2)
+    phasor: Complexes = field("1", AXES, "size")
+    turn: Complexes = field("1", AXES, "size")  # of the phasor, per sample
+    undo: Complexes = field("m/sample", AXES, 2, "size")  # now, ahead
+    shift: Array = field("rad/sample", AXES)  # of the band
+    weights: Array = field("sample", AXES, "n_weights")
+    regressor: Array = field("1", "n_weights")
+    covariance: Array = field("1", "n_weights", "n_weights")  # in units of the reading's noise
+    kalman_gain: Array = field("1", "n_weights")
+    ticks: int = field("1")
 
 
-def bmflc_params(config: TremorConfig) -> Record:
+@record
+class CombEstimator(EstimatorState):
+    """The estimator's state with the comb's."""
+
+    comb: BmflcState = field("")
+
+
+@record
+class CombNumbers(EstimatorParams):
+    """The estimator's parameters with the comb's."""
+
+    comb: BmflcParams = field("")
+
+
+def bmflc_params(config: TremorConfig) -> Records[BmflcParams]:
     """Return the kernels' parameters for ``config.method``."""
     c = config.bmflc
     size = comb_size(config)
     moves = config.method == "ebmflc"
-    return new_record(
-        bmflc_dtype(size),
+    return new(
+        BmflcParams,
         seen=seen_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
         behind_prefilter=int(config.behind_prefilter),
@@ -86,14 +95,14 @@ def bmflc_params(config: TremorConfig) -> Record:
     )
 
 
-def bmflc_state(config: TremorConfig) -> Record:
+def bmflc_state(config: TremorConfig) -> Records[BmflcState]:
     """Return the state before the first sample: no amplitude, the configured band, unknown weights."""
     size = comb_size(config)
-    return new_record(bmflc_state_dtype(size), phasor=1.0, covariance=100.0 * np.eye(2 * size + 1))
+    return new(BmflcState, {"size": size}, phasor=1.0, covariance=100.0 * np.eye(2 * size + 1))
 
 
 @kernel
-def _tune(state: Record, axis: int, params: Record) -> None:
+def _tune(state: BmflcState, axis: int, params: BmflcParams) -> None:
     """Turns and sensor factors of one axis for its present band."""
     rate = params.seen.tick_hz
     size = len(params.omega)
@@ -110,8 +119,9 @@ def _tune(state: Record, axis: int, params: Record) -> None:
 
 
 @kernel
-def bmflc_predict(state: Record, params: Record) -> None:
+def bmflc_tick(coasts: bool, states: CombEstimator, param: CombNumbers) -> None:
     """Advance one tick: the phases run on, and the weights walk."""
+    state, params = states.comb, param.comb
     size = len(params.omega)
     if state.ticks == 0:
         for i in range(AXES):
@@ -131,7 +141,7 @@ def bmflc_predict(state: Record, params: Record) -> None:
 
 
 @kernel
-def _follow(state: Record, axis: int, params: Record) -> None:
+def _follow(state: BmflcState, axis: int, params: BmflcParams) -> None:
     """Move the band's middle towards the centroid of the weights' power, within half its width."""
     size = len(params.omega)
     total, moment = 0.0, 0.0
@@ -149,12 +159,13 @@ def _follow(state: Record, axis: int, params: Record) -> None:
 
 
 @kernel
-def bmflc_correct(state: Record, samples: Array, params: Record) -> None:
-    """Process the ``samples`` (3,) of the present tick."""
+def bmflc_sample(samples: Samples, states: CombEstimator, param: CombNumbers) -> None:
+    """Process the samples of the present tick."""
+    state, params = states.comb, param.comb
     size = len(params.omega)
     x = state.regressor
     for i in range(AXES):
-        sample = samples[i]
+        sample = samples.tip[i]
         if params.behind_prefilter:
             sample = prefilter_step(sample, state.memory[i], params.sections)
         w = state.weights[i]
@@ -175,7 +186,7 @@ def bmflc_correct(state: Record, samples: Array, params: Record) -> None:
 
 
 @kernel
-def _kalman_gain(state: Record) -> None:
+def _kalman_gain(state: BmflcState) -> None:
     """Gain for the present regressor and the covariance after it; reading noise is the unit."""
     p, x, gain = state.covariance, state.regressor, state.kalman_gain
     n = len(x)
@@ -195,10 +206,19 @@ def _kalman_gain(state: Record) -> None:
 
 
 @kernel
-def bmflc_output(state: Record, axis: int, output: int) -> float:
-    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay."""
+def bmflc_output(axis: int, states: CombEstimator, param: CombNumbers) -> tuple[float, float, float]:
+    """Return the tremor now and over the loop's delay, twice, m."""
+    ahead = _sum(states.comb, axis, 1)
+    return _sum(states.comb, axis, 0), ahead, ahead
+
+
+@kernel
+def _sum(state: BmflcState, axis: int, output: int) -> float:
     total = 0.0
     for r in range(state.phasor.shape[1]):
         weight = state.weights[axis, 2 * r + 1] - 1j * state.weights[axis, 2 * r]
         total += (weight * state.phasor[axis, r] * state.undo[axis, output, r]).real
     return total
+
+
+COMB = Family(CombNumbers, CombEstimator, bmflc_params, bmflc_state, bmflc_tick, bmflc_sample, bmflc_output)

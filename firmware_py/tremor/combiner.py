@@ -11,43 +11,44 @@ from __future__ import annotations
 from cmath import exp
 from math import pi, sqrt
 
-import numpy as np
-
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
-from firmware_py.tremor.seen import SEEN, seen_params, undo
-from firmware_py.tremor.wflc import WFLC, WFLC_STATE, wflc_params, wflc_step
+from firmware_py.tremor.seen import Seen, seen_params, undo
+from firmware_py.tremor.wflc import WflcParams, WflcState, wflc_params, wflc_step
 from hal.compiled import kernel
 
 TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the start frequency
 
-COMBINER = np.dtype(
-    [
-        ("wflc", WFLC),
-        ("seen", SEEN),
-        ("sections", "f8", (3, 5)),
-        ("trailing_gain", "f8"),
-        ("bias_gain", "f8"),
-        ("behind_prefilter", "i8"),  # the FLC's input
-        ("weights_of", "i8"),
-    ]
-)
-COMBINER_STATE = np.dtype(
-    [
-        ("wflc", WFLC_STATE),
-        ("memory", "f8", (3, 2)),  # of the prefilter
-        ("weights", "f8", (3,)),  # sine, cosine, bias of the FLC, in the sample's unit
-        ("fixed_phase", "f8"),
-    ]
-)
+
+@record
+class CombinerParams:
+    """Numbers of the WFLC and of the FLC that trails it."""
+
+    wflc: WflcParams = field("")
+    seen: Seen = field("")
+    sections: Array = field("1", 3, 5)  # of the prefilter
+    trailing_gain: float = field("1")
+    bias_gain: float = field("1")
+    behind_prefilter: int = field("1")  # the FLC's input
+    weights_of: int = field("1")
 
 
-def combiner_params(config: TremorConfig) -> Record:
-    """Return the kernels' parameters (dtype ``COMBINER``)."""
-    return new_record(
-        COMBINER,
+@record
+class CombinerState:
+    """An axis: the WFLC, its prefilter, and the FLC's weights."""
+
+    wflc: WflcState = field("")
+    memory: Array = field("sample", 3, 2)  # of the prefilter
+    weights: Array = field("sample", 3)  # sine, cosine, bias of the FLC
+    fixed_phase: float = field("rad")
+
+
+def combiner_params(config: TremorConfig) -> Records[CombinerParams]:
+    """Return the kernels' parameters."""
+    return new(
+        CombinerParams,
         wflc=wflc_params(config.wflc, config.tick_hz),
         seen=seen_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
@@ -58,14 +59,14 @@ def combiner_params(config: TremorConfig) -> Record:
     )
 
 
-def combiner_state(config: TremorConfig) -> Record:
-    """Return the state before the first sample: start frequency, no amplitude."""
-    wflc = new_record(WFLC_STATE, omega=2.0 * pi * config.wflc.start_hz / config.tick_hz, miss=1.0)
-    return new_record(COMBINER_STATE, wflc=wflc)
+def combiner_state(config: TremorConfig) -> Records[CombinerState]:
+    """Return one axis' state before the first sample: start frequency, no amplitude."""
+    wflc = new(WflcState, omega=2.0 * pi * config.wflc.start_hz / config.tick_hz, miss=1.0)
+    return new(CombinerState, wflc=wflc)
 
 
 @kernel
-def combiner_step(sample: float, state: Record, params: Record) -> None:
+def combiner_step(sample: float, state: CombinerState, params: CombinerParams) -> None:
     """Process one sample, taken behind the RC filter."""
     in_band = prefilter_step(sample, state.memory, params.sections)
     wflc_step(in_band, state.wflc, params.wflc)
@@ -76,14 +77,14 @@ def combiner_step(sample: float, state: Record, params: Record) -> None:
 
 
 @kernel
-def combiner_coast(state: Record, params: Record) -> None:
+def combiner_coast(state: CombinerState, params: CombinerParams) -> None:
     """Advance one tick without a sample. The phase runs on."""
     state.wflc.phase += state.wflc.omega
     state.fixed_phase += params.wflc.start
 
 
 @kernel
-def combiner_displacement(state: Record, params: Record, ahead_s: float) -> float:
+def combiner_displacement(state: CombinerState, params: CombinerParams, ahead_s: float) -> float:
     """Return the tremor displacement (m) ``ahead_s`` after the last sample: Re[(cosine - j sine) e^(j phase) undo]."""
     omega, phase = state.wflc.omega, state.wflc.phase
     sine, cosine = state.weights[0], state.weights[1]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
-from firmware_py.records import Record, copy_record, new_record
+from firmware_py.records import Array, Records, copy_record, field, new, record
 from firmware_py.tremor.detector_config import DetectorConfig
 from firmware_py.tremor.prefilter import prefilter_step
 from hal.compiled import kernel
@@ -26,35 +26,38 @@ from hal.compiled import kernel
 SECTIONS = 3
 BANDS = 2
 
-DETECT = np.dtype(
-    [
-        ("sections", "f8", (BANDS, SECTIONS, 5)),
-        ("chi2", "f8", (BANDS,)),
-        ("keep", "f8"),
-        ("limit", "f8"),
-        ("floor2", "f8"),
-        ("hold", "f8"),
-        ("settle", "f8"),
-        ("slow", "f8"),
-        ("allowed", "f8"),
-        ("drift_limit", "f8"),
-        ("dt", "f8"),
-    ]
-)
-DETECT_STATE = np.dtype(
-    [
-        ("memory", "f8", (BANDS, 3, SECTIONS, 2)),
-        ("power", "f8", (BANDS, 3)),
-        ("slow_mean", "f8", (3,)),
-        ("statistic", "f8", (BANDS,)),
-        ("excess", "f8"),  # m/s
-        ("held", "f8"),  # ticks that the jerk flag stays up
-        ("ticks", "f8"),
-    ]
-)
+
+@record
+class DetectParams:
+    """Numbers of both detectors."""
+
+    sections: Array = field("1", BANDS, SECTIONS, 5)
+    chi2: Array = field("1", BANDS)
+    keep: float = field("1")
+    limit: float = field("1")
+    floor2: float = field("m^2/s^4")
+    hold: float = field("1")
+    settle: float = field("1")
+    slow: float = field("1")
+    allowed: float = field("m/s^2")
+    drift_limit: float = field("m/s")
+    dt: float = field("s")
 
 
-def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
+@record
+class DetectState:
+    """The detectors' memory."""
+
+    memory: Array = field("m/s^2", BANDS, 3, SECTIONS, 2)
+    power: Array = field("m^2/s^4", BANDS, 3)
+    slow_mean: Array = field("m/s^2", 3)
+    statistic: Array = field("1", BANDS)
+    excess: float = field("m/s")
+    held: float = field("1")  # ticks that the jerk flag stays up
+    ticks: float = field("1")
+
+
+def detect_params(config: DetectorConfig, tick_hz: float) -> Records[DetectParams]:
     """Return the kernel's parameters."""
     sections = np.stack(
         [
@@ -64,8 +67,8 @@ def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
             for band in (config.slow_hz, config.brisk_hz)
         ]
     )
-    return new_record(
-        DETECT,
+    return new(
+        DetectParams,
         sections=sections[:, :, [0, 1, 2, 4, 5]],
         chi2=(config.slow_chi2, config.brisk_chi2),
         keep=1.0 - exp(-1.0 / (config.background_s * tick_hz)),
@@ -81,7 +84,7 @@ def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
 
 
 @kernel
-def detect_step(x: NDArray[np.float64], state: Record, param: Record) -> int:
+def detect_step(x: NDArray[np.float64], state: DetectState, param: DetectParams) -> int:
     """Process one sample of acceleration (3,), m/s^2, and return the bits ``JERK`` and ``DRIFT`` that are set now.
 
     The background is the running mean over what has come until ``settle`` ticks, then smoothed; no jerk before that.
@@ -125,7 +128,7 @@ def detect_step(x: NDArray[np.float64], state: Record, param: Record) -> int:
 
 
 @kernel
-def detect_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+def detect_kernel(frame: NDArray[np.float64], states: Records[DetectState], params: Records[DetectParams]) -> None:
     """Add ``JERK`` and ``DRIFT`` to the frame's status; a tick without a valid new sample changes nothing."""
     state = states[0]
     status = int(frame[STATUS])
@@ -142,7 +145,9 @@ def detect_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
 
 
 @kernel
-def detect_run(samples: NDArray[np.float64], states: Record, params: Record, bits: NDArray[np.int64]) -> None:
+def detect_run(
+    samples: NDArray[np.float64], states: Records[DetectState], params: Records[DetectParams], bits: NDArray[np.int64]
+) -> None:
     """Run ``detect_step`` over samples (n, 3) and write ``bits`` (n,)."""
     for i in range(len(samples)):
         bits[i] = detect_step(samples[i], states[0], params[0])
@@ -154,7 +159,7 @@ class Detectors:
     def __init__(self, config: DetectorConfig, tick_hz: float) -> None:
         self.config = config
         self.params = detect_params(config, tick_hz)
-        self.state = new_record(DETECT_STATE)
+        self.state = new(DetectState)
 
     def step(self, frame: NDArray[np.float64]) -> None:
         detect_kernel(frame, self.state, self.params)
@@ -166,4 +171,4 @@ class Detectors:
         return bits
 
     def reset(self) -> None:
-        copy_record(self.state, new_record(DETECT_STATE))
+        copy_record(self.state, new(DetectState))

@@ -7,44 +7,19 @@ lives on the WFLC's frequency has none while the WFLC is not locked.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, nan, pi, sqrt
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record, copy_record, new_record
-from firmware_py.tremor.adaptive import (
-    adaptive_correct,
-    adaptive_dtype,
-    adaptive_output,
-    adaptive_params,
-    adaptive_predict,
-    adaptive_state,
-    adaptive_state_dtype,
-)
-from firmware_py.tremor.adaptive_design import AdaptiveDesign, design_adaptive, lever_signals
-from firmware_py.tremor.ar_kalman import (
-    AR,
-    ar_coast,
-    ar_correct,
-    ar_output,
-    ar_params,
-    ar_state,
-    ar_state_dtype,
-)
-from firmware_py.tremor.bmflc import (
-    bmflc_correct,
-    bmflc_output,
-    bmflc_params,
-    bmflc_predict,
-    bmflc_state,
-    bmflc_state_dtype,
-    comb_size,
-)
+from firmware_py.records import Array, Records, copy_record, new
+from firmware_py.tremor.adaptive import ADAPTIVE
+from firmware_py.tremor.adaptive_design import lever_signals
+from firmware_py.tremor.ar_kalman import AUTOREGRESSIVE
+from firmware_py.tremor.bmflc import COMB
 from firmware_py.tremor.combiner import (
-    COMBINER,
-    COMBINER_STATE,
     combiner_coast,
     combiner_displacement,
     combiner_params,
@@ -52,74 +27,75 @@ from firmware_py.tremor.combiner import (
     combiner_step,
 )
 from firmware_py.tremor.config import TremorConfig
-from firmware_py.tremor.oscillator_kalman import (
-    ORDER,
-    combine,
-    kalman_correct,
-    kalman_dtype,
-    kalman_params,
-    kalman_predict,
-)
-from firmware_py.tremor.own import OWN, OWN_STATE, own_params, own_step
-from hal.compiled import kernel
+from firmware_py.tremor.family import AXES, HISTORY, ROWS, TURNS, EstimatorParams, EstimatorState, Family, Samples
+from firmware_py.tremor.oscillator_kalman import KALMAN
+from firmware_py.tremor.own import FOREIGN
+from hal.compiled import inlined_kernel, kernel
+from hal.kernel_calls import ChosenKernel
 
-Array = NDArray[np.float64]
-AXES = 3
-HISTORY = 64  # ticks of predictions kept for the confidence: the longest loop delay and some
-ADAPTIVE, KALMAN, COMBINERS, COMB, AUTOREGRESSIVE, FOREIGN = range(6)
-FAMILY = {
+NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST, CORE = range(6)
+
+
+@kernel
+def _no_tick(coasts: bool, state: EstimatorState, params: EstimatorParams) -> None:
+    pass  # the combiner runs under every method
+
+
+@kernel
+def _no_sample(samples: Samples, state: EstimatorState, params: EstimatorParams) -> None:
+    pass
+
+
+@kernel
+def _combined(axis: int, state: EstimatorState, params: EstimatorParams) -> tuple[float, float, float]:
+    own, numbers = state.combiner[axis], params.combiner
+    ahead = combiner_displacement(own, numbers, numbers.seen.delay_s)
+    return combiner_displacement(own, numbers, 0.0), ahead, ahead
+
+
+def _three(config: TremorConfig) -> Any:
+    one: Any = combiner_state(config)
+    return np.repeat(one, AXES)[None, :]
+
+
+COMBINERS = Family(EstimatorParams, EstimatorState, combiner_params, _three, _no_tick, _no_sample, _combined)
+FAMILIES: Mapping[str, Family] = {
     "adaptive": ADAPTIVE,
     "kalman": KALMAN,
-    "wflc_flc": COMBINERS,
-    "flc": COMBINERS,
-    "wflc": COMBINERS,
-    "bmflc": COMB,
-    "ebmflc": COMB,
-    "bmflc_kalman": COMB,
-    "ar_kalman": AUTOREGRESSIVE,
+    "comb": COMB,
+    "ar": AUTOREGRESSIVE,
+    "own": FOREIGN,
+    "combiner": COMBINERS,
 }
-NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST, CORE = range(6)
-TURNS = 2  # signals of an axis beside the tip's acceleration
-ROWS = 6
-"""Rows of what a step gives, each for three axes."""
+"""Families by the name of their records. The combiner's records are always there and so come last."""
+FAMILY_OF: Mapping[str, str] = {
+    "adaptive": "adaptive",
+    "kalman": "kalman",
+    "wflc_flc": "combiner",
+    "flc": "combiner",
+    "wflc": "combiner",
+    "bmflc": "comb",
+    "ebmflc": "comb",
+    "bmflc_kalman": "comb",
+    "ar_kalman": "ar",
+}
+"""Family of each built-in method; a method of another package is of the family "own"."""
+_tick = ChosenKernel(FAMILIES, "tick")
+_sample = ChosenKernel(FAMILIES, "sample")
+_output = ChosenKernel(FAMILIES, "output")
 
 
-def estimator_params(config: TremorConfig) -> Record:
-    """Return the parameters of all methods; ``config.method`` selects the one that answers. ``fresh`` is the state at
-    the start."""
-    design = design_adaptive(config)
-    comb = bmflc_params(config)
-    fresh = _fresh_state(config, design)
-    dtype = np.dtype(
-        [
-            ("adaptive", adaptive_dtype(design)),
-            ("kalman", kalman_dtype(len(config.kalman.frequencies_hz))),
-            ("combiner", COMBINER),
-            ("comb", comb.dtype),
-            ("ar", AR),
-            ("own", OWN),
-            ("fresh", fresh.dtype),
-            ("family", "i8"),
-            ("needs_lock", "i8"),
-            ("delay_ticks", "i8"),
-            ("settle_ticks", "f8"),
-            ("max_gap_ticks", "f8"),
-            ("lever", "f8", (AXES, TURNS, AXES)),  # m, from angular acceleration to an axis' further signals
-            ("smoothing", "f8"),
-            ("floor2", "f8"),  # m^2
-        ]
-    )
-    chosen = {"kalman": kalman_params(config)} if config.method == "kalman" else {}
-    return new_record(
-        dtype,
-        **chosen,
-        adaptive=adaptive_params(config, design),
-        combiner=combiner_params(config),
-        comb=comb,
-        ar=ar_params(config),
-        own=own_params(config),
-        fresh=fresh,
-        family=FAMILY.get(config.method, FOREIGN),
+def estimator_params(config: TremorConfig) -> Records[EstimatorParams]:
+    """Return the parameters of ``config.method`` and of the combiner, and in ``fresh`` the state at the start."""
+    name = FAMILY_OF.get(config.method, "own")
+    family = FAMILIES[name]
+    state = {n: FAMILIES[n].new_state(config) for n in ("combiner", name)}
+    params: dict[str, Any] = {n: FAMILIES[n].new_params(config) for n in ("combiner", name)}
+    return new(
+        family.params,
+        None,
+        **params,
+        fresh=new(family.state, last_tick=np.nan, **state),
         needs_lock=int(config.method in ("wflc", "wflc_flc")),
         delay_ticks=min(HISTORY - 1, round(config.loop_delay_s * config.tick_hz)),
         settle_ticks=config.settle_s * config.tick_hz,
@@ -130,111 +106,38 @@ def estimator_params(config: TremorConfig) -> Record:
     )
 
 
-def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
-    dtype = np.dtype(
-        [
-            ("adaptive", adaptive_state_dtype(design)),
-            ("kalman", "f8", (AXES, ORDER * len(config.kalman.frequencies_hz) + 2)),
-            ("combiner", COMBINER_STATE, (AXES,)),
-            ("comb", bmflc_state_dtype(comb_size(config))),
-            ("ar", ar_state_dtype(config)),
-            ("own", OWN_STATE),
-            ("predicted", "f8", (AXES, HISTORY)),  # ring of past predictions
-            ("at", "i8"),
-            ("power", "f8", (AXES,)),  # smoothed x^2
-            ("miss", "f8", (AXES,)),  # smoothed (x - predicted)^2
-            ("ticks", "f8"),  # since the start
-            ("last_tick", "f8"),  # of the stage that reads frames
-            ("samples", "f8", (AXES,)),
-            ("turned", "f8", (AXES, TURNS)),  # the turns across the arm, a part of the samples, and about it
-            ("out", "f8", (ROWS, AXES)),
-        ]
-    )
-    return new_record(
-        dtype,
-        adaptive=adaptive_state(design),
-        combiner=combiner_state(config),
-        comb=bmflc_state(config),
-        ar=ar_state(config),
-        last_tick=np.nan,
-    )
-
-
-def estimator_state(params: Record) -> Record:
+def estimator_state(params: Records[EstimatorParams]) -> Records[EstimatorState]:
     """Return the state before the first sample."""
-    return np.array(params["fresh"])
+    return cast("Records[EstimatorState]", np.array(params["fresh"]))
 
 
-@kernel
-def _foreign(state: Record, i: int, have: bool, param: Record) -> None:
-    """Run one tick of an estimator from another package."""
-    memory, numbers, out = state.own.memory[i], param.own.numbers, state.own.out[i]
-    own_step(param.own.address, memory.ctypes.data, numbers.ctypes.data, state.samples[i], int(have), out.ctypes.data)
-
-
-@kernel
-def estimator_ticks(state: Record, steps: int, coast: bool, param: Record) -> None:
+@inlined_kernel
+def estimator_ticks(state: EstimatorState, steps: int, coast: bool, param: EstimatorParams) -> None:
     """``steps`` ticks of time; the last one has a sample to come unless ``coast``."""
     state.ticks += steps
     for n in range(steps):
         state.at = (state.at + 1) % HISTORY
-        if param.family == ADAPTIVE:
-            adaptive_predict(state.adaptive, param.adaptive)
-        elif param.family == COMB:
-            bmflc_predict(state.comb, param.comb)
-        elif param.family == AUTOREGRESSIVE:
-            ar_coast(state.ar)
-        for i in range(AXES):
-            if param.family == KALMAN:
-                kalman_predict(state.kalman[i], param.kalman)
-            elif param.family == FOREIGN and (coast or n < steps - 1):
-                _foreign(state, i, False, param)
-            if coast or n < steps - 1:
+        coasts = coast or n < steps - 1
+        _tick(coasts, state, param)
+        if coasts:
+            for i in range(AXES):
                 combiner_coast(state.combiner[i], param.combiner)
 
 
-@kernel
-def estimator_samples(state: Record, param: Record) -> None:
+@inlined_kernel
+def estimator_samples(state: EstimatorState, param: EstimatorParams) -> None:
     """Process the present tick's ``state.samples``."""
     for i in range(AXES):
-        sample = state.samples[i]
-        combiner_step(sample, state.combiner[i], param.combiner)
-        if param.family == ADAPTIVE:
-            adaptive_correct(state.adaptive, i, sample, state.turned[i], param.adaptive)
-        elif param.family == KALMAN:
-            kalman_correct(state.kalman[i], sample, param.kalman)
-        elif param.family == AUTOREGRESSIVE:
-            ar_correct(state.ar, i, sample, param.ar)
-        elif param.family == FOREIGN:
-            _foreign(state, i, True, param)
-    if param.family == COMB:
-        bmflc_correct(state.comb, state.samples, param.comb)
+        combiner_step(state.samples[i], state.combiner[i], param.combiner)
+    _sample(Samples(state.samples, state.turned, state.up), state, param)
 
 
-@kernel
-def estimator_output(state: Record, param: Record) -> None:
+@inlined_kernel
+def estimator_output(state: EstimatorState, param: EstimatorParams) -> None:
     """Fill ``state.out``."""
     out = state.out
-    combiner = param.combiner
     for i in range(AXES):
-        if param.family == ADAPTIVE:
-            now = adaptive_output(state.adaptive, i, 0)
-            ahead = adaptive_output(state.adaptive, i, 1)
-        elif param.family == KALMAN:
-            now = combine(state.kalman[i], param.kalman.now)
-            ahead = combine(state.kalman[i], param.kalman.ahead)
-        elif param.family == COMB:
-            now = bmflc_output(state.comb, i, 0)
-            ahead = bmflc_output(state.comb, i, 1)
-        elif param.family == AUTOREGRESSIVE:
-            now = ar_output(state.ar, i, 0, param.ar)
-            ahead = ar_output(state.ar, i, 1, param.ar)
-        elif param.family == FOREIGN:
-            now = state.own.out[i, 0]
-            ahead = state.own.out[i, 1]
-        else:
-            now = combiner_displacement(state.combiner[i], combiner, 0.0)
-            ahead = combiner_displacement(state.combiner[i], combiner, combiner.seen.delay_s)
+        now, ahead, core = _output(i, state, param)
         ring = state.predicted[i]
         missed = now - ring[(state.at - param.delay_ticks) % HISTORY]
         ring[state.at] = ahead
@@ -242,9 +145,8 @@ def estimator_output(state: Record, param: Record) -> None:
         state.miss[i] += param.smoothing * (missed * missed - state.miss[i])
         out[NOW, i] = now
         out[AHEAD, i] = ahead
-        # the other methods know no band but the tremor's
-        out[CORE, i] = adaptive_output(state.adaptive, i, 2) if param.family == ADAPTIVE else ahead
-        out[FREQUENCY, i] = state.combiner[i].wflc.omega * combiner.seen.tick_hz / (2.0 * pi)
+        out[CORE, i] = core
+        out[FREQUENCY, i] = state.combiner[i].wflc.omega * param.combiner.seen.tick_hz / (2.0 * pi)
         out[AMPLITUDE, i] = sqrt(2.0 * state.power[i])
         trust = 0.0
         if state.ticks > param.settle_ticks and not (param.needs_lock and state.combiner[i].wflc.miss > 0.7):
@@ -254,7 +156,9 @@ def estimator_output(state: Record, param: Record) -> None:
 
 
 @kernel
-def run_estimator(samples: Array, out: Array, states: Record, params: Record) -> None:
+def run_estimator(
+    samples: Array, out: Array, states: Records[EstimatorState], params: Records[EstimatorParams]
+) -> None:
     """``samples`` (n, 3), one a tick, into ``out`` (n, 6, 3). A sample that is not finite is coasted over."""
     state, param = states[0], params[0]
     for k in range(len(samples)):
@@ -266,7 +170,9 @@ def run_estimator(samples: Array, out: Array, states: Record, params: Record) ->
         if good:
             estimator_samples(state, param)
         estimator_output(state, param)
-        out[k, :, :] = state.out
+        for row in range(ROWS):
+            for i in range(AXES):
+                out[k, row, i] = state.out[row, i]
 
 
 @dataclass(frozen=True)

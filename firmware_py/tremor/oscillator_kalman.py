@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg as scipy_linalg  # pyright: ignore[reportMissingTypeStubs]
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
 from hal.compiled import kernel
 
 Matrix = NDArray[np.float64]
@@ -111,29 +112,40 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     return OscillatorModel(f, gain, c[0], now, ahead, float(np.sqrt(now @ posterior @ now)), m)
 
 
-def kalman_dtype(n_modes: int) -> np.dtype[Any]:
-    """Parameters for ``n_modes``: the transition is block diagonal but for its last row, and kept so."""
-    n = ORDER * n_modes + 2
-    return np.dtype(
-        [
-            ("blocks", "f8", (n_modes, ORDER, ORDER)),
-            ("drift", "f8"),
-            ("last_row", "f8", (n,)),
-            ("gain", "f8", (n,)),
-            ("observe", "f8"),
-            ("now", "f8", (n,)),
-            ("ahead", "f8", (n,)),
-        ]
-    )
+@record
+class KalmanParams:
+    """The filter: its transition is block diagonal but for its last row, and kept so. States are balanced."""
+
+    blocks: Array = field("1", "modes", ORDER, ORDER)
+    drift: float = field("1")
+    last_row: Array = field("1", "states")
+    gain: Array = field("s^2/m", "states")
+    observe: float = field("m/s^2")
+    now: Array = field("m", "states")
+    ahead: Array = field("m", "states")
 
 
-def kalman_params(config: TremorConfig) -> Record:
-    """Return the kernel's parameters (dtype ``kalman_dtype``)."""
+@record
+class KalmanEstimator(EstimatorState):
+    """The estimator's state with the Kalman filter's."""
+
+    kalman: Array = field("1", AXES, "states")
+
+
+@record
+class KalmanNumbers(EstimatorParams):
+    """The estimator's parameters with the Kalman filter's."""
+
+    kalman: KalmanParams = field("")
+
+
+def kalman_params(config: TremorConfig) -> Records[KalmanParams]:
+    """Return the kernel's parameters."""
     model = design_oscillators(config)
     blocks = [model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)]
-    return new_record(
-        kalman_dtype(model.n_modes),
-        blocks=blocks,
+    return new(
+        KalmanParams,
+        blocks=np.array(blocks),
         drift=model.transition[-2, -2],
         last_row=model.transition[-1],
         gain=model.gain,
@@ -144,7 +156,7 @@ def kalman_params(config: TremorConfig) -> Record:
 
 
 @kernel
-def kalman_predict(state: NDArray[np.float64], params: Record) -> None:
+def kalman_predict(state: NDArray[np.float64], params: KalmanParams) -> None:
     """s <- F s for one axis, one tick; ``state`` (4 m + 2,)."""
     n = len(state)
     last = 0.0
@@ -161,7 +173,7 @@ def kalman_predict(state: NDArray[np.float64], params: Record) -> None:
 
 
 @kernel
-def kalman_correct(state: NDArray[np.float64], measured: float, params: Record) -> None:
+def kalman_correct(state: NDArray[np.float64], measured: float, params: KalmanParams) -> None:
     """s += K (y - C s): ``measured`` is the tip's acceleration m/s^2, behind the RC filter."""
     n = len(state)
     innovation = measured - params.observe * state[n - 1]
@@ -176,3 +188,28 @@ def combine(state: NDArray[np.float64], row: NDArray[np.float64]) -> float:
     for i in range(len(state)):
         total += row[i] * state[i]
     return total
+
+
+def _state(config: TremorConfig) -> Matrix:
+    return np.zeros((AXES, ORDER * len(config.kalman.frequencies_hz) + 2))
+
+
+@kernel
+def _tick(coasts: bool, state: KalmanEstimator, params: KalmanNumbers) -> None:
+    for i in range(AXES):
+        kalman_predict(state.kalman[i], params.kalman)
+
+
+@kernel
+def _sample(samples: Samples, state: KalmanEstimator, params: KalmanNumbers) -> None:
+    for i in range(AXES):
+        kalman_correct(state.kalman[i], samples.tip[i], params.kalman)
+
+
+@kernel
+def _output(axis: int, state: KalmanEstimator, params: KalmanNumbers) -> tuple[float, float, float]:
+    ahead = combine(state.kalman[axis], params.kalman.ahead)
+    return combine(state.kalman[axis], params.kalman.now), ahead, ahead
+
+
+KALMAN = Family(KalmanNumbers, KalmanEstimator, kalman_params, _state, _tick, _sample, _output)

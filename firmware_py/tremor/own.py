@@ -9,26 +9,56 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numba
 import numpy as np
 from llvmlite import ir  # pyright: ignore[reportMissingTypeStubs]
 from numba import types
+from numba.core import cgutils
 from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from firmware_py.tremor.config import METHODS, TremorConfig
+from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
+from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.plugins import ESTIMATORS, load
 
 STATE = 256  # numbers of memory for each axis
 NUMBERS = 64  # of the design
-AXES = 3
-OWN = np.dtype([("address", "i8"), ("numbers", "f8", (NUMBERS,))])
-OWN_STATE = np.dtype([("memory", "f8", (AXES, STATE)), ("out", "f8", (AXES, 2))])
+
+
+@record
+class OwnParams:
+    """The arguments of an estimator of another package."""
+
+    address: int = field("1")  # of its step
+    numbers: Array = field("as its design says", NUMBERS)
+
+
+@record
+class OwnState:
+    """The memory and the results of an estimator of another package."""
+
+    memory: Array = field("as its step says", AXES, STATE)
+    out: Array = field("m", AXES, 2)
+
+
+@record
+class ForeignEstimator(EstimatorState):
+    """The estimator's state with that of another package's."""
+
+    own: OwnState = field("")
+
+
+@record
+class ForeignNumbers(EstimatorParams):
+    """The estimator's parameters with those of another package's."""
+
+    own: OwnParams = field("")
 
 
 @dataclass(frozen=True)
@@ -45,17 +75,17 @@ class OwnEstimator:
     step: Callable[..., None]
 
 
-def own_params(config: TremorConfig) -> Record:
+def own_params(config: TremorConfig) -> Records[OwnParams]:
     """``address`` 0 for the methods that are built in. ``BenchError`` for a package that does not keep to the rules."""
     estimator = None if config.method in METHODS else load(ESTIMATORS, config.method, OwnEstimator)
     if estimator is None:
-        return new_record(OWN)
+        return new(OwnParams)
     given = np.asarray(estimator.design(config), dtype=np.float64)
     if given.ndim != 1 or len(given) > NUMBERS or not np.isfinite(given).all():
         raise BenchError(f"estimator '{config.method}': its design must be up to {NUMBERS} finite numbers")
     numbers = np.zeros(NUMBERS)
     numbers[: len(given)] = given
-    return new_record(OWN, address=_compiled(estimator.step).address, numbers=numbers)
+    return new(OwnParams, address=_compiled(estimator.step).address, numbers=numbers)
 
 
 @cache  # keeps the machine code alive as long as the process may use its address
@@ -73,19 +103,52 @@ def _compiled(step: Callable[..., None]) -> Any:
         raise BenchError(f"step {step.__module__}.{step.__qualname__} cannot be compiled: {error}") from error
 
 
-def _own_step(typing: Any, address: Any, memory: Any, numbers: Any, sample: Any, have: Any, out: Any) -> Any:
+def _own_step(typing: Any, address: Any, where: Any, sample: Any, have: Any) -> Any:
     i8, f8 = types.int64, types.float64
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         floats = ir.DoubleType().as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [floats, floats, ir.DoubleType(), ir.IntType(64), floats])
         function = builder.inttoptr(given[0], kind.as_pointer())
-        place = [builder.inttoptr(given[i], floats) for i in (1, 2, 5)]
-        builder.call(function, [place[0], place[1], given[3], given[4], place[2]])
+        places = cast(Any, cgutils).unpack_tuple(builder, given[1], 3)
+        memory, numbers, out = (builder.inttoptr(place, floats) for place in places)
+        builder.call(function, [memory, numbers, given[2], given[3], out])
         return context.get_dummy_value()
 
-    return types.void(i8, i8, i8, f8, i8, i8), generate
+    return types.void(i8, types.UniTuple(i8, 3), f8, i8), generate
 
 
 own_step: Callable[..., None] = intrinsic(_own_step)
-"""Lets kernels call the function at an address with memory, numbers, sample, have, out; arrays as addresses."""
+"""Lets kernels call the function at an address with (memory, numbers, out) as addresses, sample, have."""
+
+
+@kernel
+def _run(i: int, have: bool, sample: float, state: ForeignEstimator, params: ForeignNumbers) -> None:
+    memory, numbers, out = state.own.memory[i], params.own.numbers, state.own.out[i]
+    own_step(params.own.address, (memory.ctypes.data, numbers.ctypes.data, out.ctypes.data), sample, int(have))
+
+
+@kernel
+def _tick(coasts: bool, state: ForeignEstimator, params: ForeignNumbers) -> None:
+    if coasts:
+        for i in range(AXES):
+            _run(i, False, 0.0, state, params)
+
+
+@kernel
+def _sample(samples: Samples, state: ForeignEstimator, params: ForeignNumbers) -> None:
+    for i in range(AXES):
+        _run(i, True, samples.tip[i], state, params)
+
+
+@kernel
+def _output(axis: int, state: ForeignEstimator, params: ForeignNumbers) -> tuple[float, float, float]:
+    out = state.own.out[axis]
+    return out[0], out[1], out[1]
+
+
+def _state(config: TremorConfig) -> Records[OwnState]:
+    return new(OwnState)
+
+
+FOREIGN = Family(ForeignNumbers, ForeignEstimator, own_params, _state, _tick, _sample, _output)

@@ -10,19 +10,25 @@ from __future__ import annotations
 from cmath import exp
 from math import isfinite
 
-import numpy as np
-
-from firmware_py.records import Record, new_record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from hal.compiled import kernel
 
-SEEN = np.dtype([("tick_hz", "f8"), ("lag_s", "f8"), ("accelerates", "i8"), ("delay_s", "f8")])
+
+@record
+class Seen:
+    """The sensor and its filter, between the tip and the samples."""
+
+    tick_hz: float = field("Hz")
+    lag_s: float = field("s")  # of the RC filter, 0 without one
+    accelerates: int = field("1")  # 1: the sensor sees acceleration
+    delay_s: float = field("s")  # of the loop
 
 
-def seen_params(config: TremorConfig) -> Record:
-    """``lag_s`` is the RC filter's time constant, 0 without one."""
-    return new_record(
-        SEEN,
+def seen_params(config: TremorConfig) -> Records[Seen]:
+    """Return what ``config`` says of the sensor."""
+    return new(
+        Seen,
         tick_hz=config.tick_hz,
         lag_s=1.0 / config.filter_cutoff_rad_s if isfinite(config.filter_cutoff_rad_s) else 0.0,
         accelerates=int(config.sees == "acceleration"),
@@ -31,7 +37,7 @@ def seen_params(config: TremorConfig) -> Record:
 
 
 @kernel
-def undo(omega_rad_s: float, ahead_s: float, seen: Record) -> complex:
+def undo(omega_rad_s: float, ahead_s: float, seen: Seen) -> complex:
     """Factor from a sample's phasor to the displacement's phasor ``ahead_s`` later."""
     factor = (1.0 + 1j * omega_rad_s * seen.lag_s) * exp(1j * omega_rad_s * ahead_s)
     if seen.accelerates:

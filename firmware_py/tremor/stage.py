@@ -23,28 +23,29 @@ from firmware_py.frame import (
     TREMOR_CORE,
     TREMOR_FREQUENCY,
 )
-from firmware_py.records import Record, copy_record
+from firmware_py.records import Records, copy_record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.estimator import (
     AHEAD,
     AMPLITUDE,
-    AXES,
     CORE,
     FREQUENCY,
     NOW,
     TRUST,
-    TURNS,
     estimator_output,
     estimator_params,
     estimator_samples,
     estimator_state,
     estimator_ticks,
 )
+from firmware_py.tremor.family import AXES, TURNS, EstimatorParams, EstimatorState
 from hal.compiled import kernel
 
 
 @kernel
-def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+def estimate_kernel(
+    frame: NDArray[np.float64], states: Records[EstimatorState], params: Records[EstimatorParams]
+) -> None:
     """Fill the columns from ``tremor`` to ``confidence`` and add the bit ``SETTLING`` to ``status``.
 
     Input: ``tip_acceleration`` (3,) in m/s^2 and ``angular_acceleration`` (3,) in rad/s^2, both in the body frame.
@@ -82,7 +83,7 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
                     turned += param.lever[i, c, j] * frame[ANGULAR_ACCELERATION + j]
                 state.turned[i, c] = turned
         w, x, y, z = frame[QUATERNION], frame[QUATERNION + 1], frame[QUATERNION + 2], frame[QUATERNION + 3]
-        up = state.adaptive.up
+        up = state.up
         up[0], up[1], up[2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
         estimator_samples(state, param)
     estimator_output(state, param)

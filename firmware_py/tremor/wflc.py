@@ -9,40 +9,41 @@ from __future__ import annotations
 
 from math import cos, exp, pi, sin, sqrt
 
-import numpy as np
-
-from firmware_py.records import Record, new_record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import WflcConfig
 from hal.compiled import kernel
 
-WFLC = np.dtype(
-    [
-        ("start", "f8"),  # rad per sample, as the two limits
-        ("low", "f8"),
-        ("high", "f8"),
-        ("frequency_gain", "f8"),
-        ("weight_gain", "f8"),
-        ("keep", "f8"),  # 1 - leakage
-        ("power_smoothing", "f8"),
-    ]
-)
-WFLC_STATE = np.dtype(
-    [
-        ("omega", "f8"),  # rad per sample
-        ("phase", "f8"),  # running sum of omega, rad, within 2 pi
-        ("sine", "f8"),
-        ("cosine", "f8"),
-        ("power", "f8"),
-        ("miss", "f8"),  # smoothed error^2 of the normalised signal: 0 locked .. 1 nothing explained
-    ]
-)
+
+@record
+class WflcParams:
+    """Numbers of the combiner that tracks the frequency."""
+
+    start: float = field("rad/sample")
+    low: float = field("rad/sample")
+    high: float = field("rad/sample")
+    frequency_gain: float = field("1")
+    weight_gain: float = field("1")
+    keep: float = field("1")  # 1 - leakage
+    power_smoothing: float = field("1")
 
 
-def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
-    """Return the kernel's parameters (dtype ``WFLC``)."""
+@record
+class WflcState:
+    """Frequency, phase and weights of the combiner."""
+
+    omega: float = field("rad/sample")
+    phase: float = field("rad")  # running sum of omega, within 2 pi
+    sine: float = field("1")
+    cosine: float = field("1")
+    power: float = field("sample^2")
+    miss: float = field("1")  # smoothed error^2 of the normalised signal: 0 locked .. 1 nothing explained
+
+
+def wflc_params(config: WflcConfig, tick_hz: float) -> Records[WflcParams]:
+    """Return the kernel's parameters."""
     per_sample = 2.0 * pi / tick_hz
-    return new_record(
-        WFLC,
+    return new(
+        WflcParams,
         start=config.start_hz * per_sample,
         low=config.low_hz * per_sample,
         high=config.high_hz * per_sample,
@@ -54,7 +55,7 @@ def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
 
 
 @kernel
-def wflc_step(signal: float, state: Record, params: Record) -> None:
+def wflc_step(signal: float, state: WflcState, params: WflcParams) -> None:
     """Process one sample of the band-passed signal, any unit: advance phase, weights and frequency.
 
     The frequency step follows -d(error^2)/d(omega) with the phase as a running sum (erratum 53).

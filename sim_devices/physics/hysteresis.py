@@ -203,6 +203,7 @@ def columns(
     hi: float,
     rest: float,
     starts: tuple[int, ...],
+    *,
     wide_too: bool = False,
     before: float | None = None,
     bent: Bent | None = None,
@@ -213,7 +214,7 @@ def columns(
     ``wide_too`` adds elements wider than half the range. ``bent`` is the loop that a curve behind the elements acts on.
     """
     if before is not None:
-        return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too, None, bent)[2:]
+        return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too=wide_too, bent=bent)[2:]
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
     # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
@@ -291,7 +292,7 @@ class Chosen:
 
 
 def left_out(
-    x: Array, residual: Array, ctx: Context, form: str, lo: float, hi: float, before: float | None = None
+    x: Array, residual: Array, ctx: Context, form: str, lo: float, hi: float, *, before: float | None = None
 ) -> Chosen:
     """Return the form with its sum of squares on left-out blocks and the sign of its weights."""
     index = thin(ctx.keep, 6000)
@@ -300,7 +301,7 @@ def left_out(
     first = float(x[0])
     wide = slips_once(lo, hi, first if before is None else before)
     bent = loop_of(x, residual, ctx, lo, hi, wide=wide, before=before) if form == "stops_curved" else None
-    e = columns(x, form, lo, hi, first, ctx.starts, wide, before, bent).T
+    e = columns(x, form, lo, hi, first, ctx.starts, wide_too=wide, before=before, bent=bent).T
     a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
 
     def left(sign: float) -> float:
@@ -320,7 +321,7 @@ def left_out(
 def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, *, wide: bool, before: float | None) -> Bent:
     """Fit the loop of stops to the output."""
     index = thin(ctx.keep, 6000)
-    e = columns(x, "stops", lo, hi, float(x[0]), ctx.starts, wide, before)
+    e = columns(x, "stops", lo, hi, float(x[0]), ctx.starts, wide_too=wide, before=before)
     through = [ctx.to_output(np.ascontiguousarray(c))[index] for c in (x, *e.T)]
     a, y = np.column_stack([np.ones(index.size), *through]), ctx.wanted(x, residual)[index]
     found = [signed_least_squares(a, y, np.r_[0.0, 0.0, np.full(e.shape[1], sign)], 1e-6) for sign in (-1.0, 1.0)]
@@ -339,9 +340,9 @@ def choose(x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms:
     """
 
     def best_of(forms: Sequence[str], before: float | None) -> Chosen:
-        best = left_out(x, residual, ctx, forms[0], lo, hi, before)
+        best = left_out(x, residual, ctx, forms[0], lo, hi, before=before)
         for form in forms[1:]:
-            other = left_out(x, residual, ctx, form, lo, hi, before)
+            other = left_out(x, residual, ctx, form, lo, hi, before=before)
             if other.left < NEED * best.left:
                 best = other
         return best
@@ -407,7 +408,8 @@ def _parts(settings: Settings) -> Parts:
 def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
     rest, before = settings.get("rest", (0.0,))[0], way_before(settings)
-    return columns(x, _form(settings), lo, hi, rest, ctx.starts, _wide(settings), before, bent_of(settings))
+    wide, bent = _wide(settings), bent_of(settings)
+    return columns(x, _form(settings), lo, hi, rest, ctx.starts, wide_too=wide, before=before, bent=bent)
 
 
 def loop_width(y_of: Array, turns: int) -> float:
@@ -432,7 +434,8 @@ def test_cycle(lo: float, hi: float) -> Array:
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     lo, hi = settings["range"]
     x = test_cycle(lo, hi)
-    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,), _wide(settings), None, bent_of(settings)) @ p
+    wide, bent = _wide(settings), bent_of(settings)
+    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,), wide_too=wide, bent=bent) @ p
     return (Human("loop_width_share", loop_width(y, 3), "1"),)
 
 

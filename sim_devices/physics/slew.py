@@ -16,12 +16,13 @@ SUBSTEPS = 8  # where a limited course meets its input again lies between sample
 
 
 @kernel
-def slew(x, down, up, share, starts, parts, rounded):
+def slew(x, most, share, starts, parts, rounded):
     """Follow x at a limited rate; x runs straight between samples and each sample is divided into ``parts`` steps.
 
-    A step moves by ``share`` of the distance, by at most ``up`` or ``down``; ``rounded`` smooths the limit by a
+    A step moves by ``share`` of the distance, by at most ``most`` (down, up); ``rounded`` smooths the limit by a
     hyperbolic tangent. The output equals x at each start.
     """
+    down, up = most
     y = np.empty_like(x)
     s = 0
     v = 0.0
@@ -33,8 +34,8 @@ def slew(x, down, up, share, starts, parts, rounded):
             for k in range(1, parts + 1):
                 d = share * (x[i - 1] + (x[i] - x[i - 1]) * k / parts - v)
                 if rounded:
-                    most = up if d > 0.0 else down
-                    v += most * np.tanh(d / most)
+                    limit = up if d > 0.0 else down
+                    v += limit * np.tanh(d / limit)
                 else:
                     v += min(max(d, -down), up)
         y[i] = v
@@ -63,7 +64,7 @@ def _slew_parts(settings: Settings) -> Parts:
 
 def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     h = ctx.dt / SUBSTEPS
-    return slew(x, q[1] * h, q[0] * h, -np.expm1(-h / q[2]), np.array(ctx.starts), SUBSTEPS, False)
+    return slew(x, (q[1] * h, q[0] * h), -np.expm1(-h / q[2]), np.array(ctx.starts), SUBSTEPS, False)
 
 
 def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -137,7 +138,7 @@ def _rounded_parts(settings: Settings) -> Parts:
 
 def _rounded_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     h = ctx.dt / SUBSTEPS
-    return slew(x, q[0] * h, q[0] * h, -np.expm1(-h / q[1]), np.array(ctx.starts), SUBSTEPS, True)
+    return slew(x, (q[0] * h, q[0] * h), -np.expm1(-h / q[1]), np.array(ctx.starts), SUBSTEPS, True)
 
 
 _ROUNDED_SLEW = replace(

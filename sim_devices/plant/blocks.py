@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 class PlantBlocks:
     """Computes one run of one instrument in one hand, in blocks of ``ms`` milliseconds (a multiple of ``BLOCK_MS``).
 
-    ``plant``, ``state``: one-row structured arrays; ``nodes``, ``parts``, ``noise``, ``slow``: the present block's, as
-    ``advance`` wants them. ``truth`` (n + 1, TRUTH_COLUMNS) has a row for each of ``total_ms`` milliseconds.
+    ``plant``, ``state``: one-row structured arrays; ``block``: the present one's ``nodes``, ``parts``, ``noise`` and
+    ``slow``, as ``advance`` wants them. ``truth`` (n + 1, TRUTH_COLUMNS) has a row for each of ``total_ms``.
     """
 
     def __init__(self, config: EmulationConfig, hand: Hand, total_ms: int, *, ms: int = 16 * BLOCK_MS) -> None:
@@ -34,6 +34,7 @@ class PlantBlocks:
         self.ms = ms
         self.nodes, self.parts = np.zeros((ms + 1, 18)), np.zeros((ms, 6))
         self.noise, self.slow = np.zeros((ms * STEPS_PER_MS, NOISES)), np.zeros((ms, SLOW_NOISES))
+        self.block = self.nodes, self.parts, self.noise, self.slow
         self.truth = np.zeros((total_ms + 1, TRUTH_COLUMNS))
         self._hand = hand
         self._rng = stream(config.seed, "instrument.noise")

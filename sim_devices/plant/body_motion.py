@@ -51,7 +51,9 @@ def rotation(angles_deg: tuple[float, float, float]) -> Array:
 
 
 @kernel
-def _felt(f, w, alpha, position, origin, turn, felt, turned):
+def _felt(moves, mount, felt, turned):
+    """``moves``: specific force, rate, angular acceleration and where they are felt; ``mount``: position and turn."""
+    (f, w, alpha, origin), (position, turn) = moves, mount
     rx, ry, rz = position[0] - origin[0], position[1] - origin[1], position[2] - origin[2]
     along = w[0] * rx + w[1] * ry + w[2] * rz
     w2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -77,8 +79,8 @@ class Mount:
         """
         f, w = motion.specific_force_m_s2, motion.rate_rad_s
         felt, turned = np.empty(3), np.empty(3)
-        alpha = motion.angular_acceleration_rad_s2
-        _felt(f, w, alpha, self.position_m, motion.origin_m, self.turn, felt, turned)
+        moves = f, w, motion.angular_acceleration_rad_s2, motion.origin_m
+        _felt(moves, (self.position_m, self.turn), felt, turned)
         return felt, turned
 
     def field_uT(self, motion: BodyMotion) -> Array:

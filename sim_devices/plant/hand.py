@@ -160,7 +160,7 @@ class SyntheticHand:
         while end_s > self._planned_s:
             self._plan(2.0 * self._planned_s)
         noise = self._noise.standard_normal((pose.shape[0], PROCESSES))
-        hand_nodes(self._p, self._s, noise, self._reaches, self._jerks, pose, parts)
+        hand_nodes(self._p, self._s, noise, (self._reaches, self._jerks), pose, parts)
 
     def _plan(self, seconds: float) -> None:
         """Plan reaches and jerks for at least ``seconds``. A longer plan begins with the shorter one."""

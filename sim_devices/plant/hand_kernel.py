@@ -137,13 +137,14 @@ def hand_pose(p, s, reaches, jerks, pose, parts):
 
 
 @kernel
-def hand_nodes(p, s, noise, reaches, jerks, pose, parts):
-    """Fill the next n nodes: ``pose`` (n, 18), ``parts`` (n, 6).
+def hand_nodes(p, s, noise, plan, pose, parts):
+    """Fill the next n nodes: ``pose`` (n, 18), ``parts`` (n, 6). ``plan``: reaches and jerks.
 
     ``noise`` (n, PROCESSES) standard normal, held from node to node. ``p``, ``s``: one-row structured arrays HAND,
     HAND_STATE; ``s`` moves on.
     """
     par, state = p[0], s[0]
+    reaches, jerks = plan
     a, b, x = par["transition"], par["drive"], state["x"]
     two_pi = 2.0 * math.pi
     for j in range(pose.shape[0]):

@@ -135,8 +135,11 @@ def triad_unit(spec: TriadSpec, rng: np.random.Generator, errors: float = 1.0, n
 
 
 @kernel
-def _triad_step(gain, bias, bias_per_K, scale_per_K, per_m_s2, feels, force, warm_K, state, draw, weights, out):
-    """Compute one sample ``out`` (3,) and update ``state`` (4, 3). ``draw`` (6,) is standard normal."""
+def _triad_step(unit, felt, state, draw, weights, out):
+    """Compute one sample ``out`` (3,) and update ``state`` (4, 3). ``draw`` (6,) is standard normal; ``felt``: what is
+    measured, the specific force, and how far the sensor is above its reference temperature."""
+    gain, bias, bias_per_K, scale_per_K, per_m_s2 = unit
+    feels, force, warm_K = felt
     keep, start, end, sigma, drift_keep, drift = weights
     for i in range(3):
         u = gain[i, 0] * feels[0] + gain[i, 1] * feels[1] + gain[i, 2] * feels[2]
@@ -173,14 +176,8 @@ class Triad:
         self._t_ns = max(t_ns, self._t_ns)
         out = np.empty(3)
         _triad_step(
-            unit.gain,
-            unit.bias,
-            unit.bias_per_K,
-            unit.scale_per_K,
-            unit.per_m_s2,
-            feels,
-            force,
-            temperature_C - REFERENCE_C,
+            (unit.gain, unit.bias, unit.bias_per_K, unit.scale_per_K, unit.per_m_s2),
+            (feels, force, temperature_C - REFERENCE_C),
             self._state,
             self._draw(),
             (keep, start, end, unit.noise_density * math.sqrt(bandwidth_hz), drift_keep, unit.drift),
@@ -239,8 +236,9 @@ class Imu:
         """Compile or load now, not when the first sample is due in real time."""
         self._mount.felt(BodyMotion(np.eye(3), np.zeros(3), np.zeros(3)))
         unit, zeros = self.accelerometer.unit, np.zeros(3)
-        vectors = (unit.gain, unit.bias, unit.bias_per_K, unit.scale_per_K, unit.per_m_s2, zeros, zeros)
-        _triad_step(*vectors, 0.0, np.zeros((4, 3)), np.zeros(6), (0.0, 0.0, 1.0, 0.0, 1.0, 0.0), np.empty(3))
+        errors = unit.gain, unit.bias, unit.bias_per_K, unit.scale_per_K, unit.per_m_s2
+        weights = (0.0, 0.0, 1.0, 0.0, 1.0, 0.0)
+        _triad_step(errors, (zeros, zeros, 0.0), np.zeros((4, 3)), np.zeros(6), weights, np.empty(3))
 
     def temperature_C(self, t_ns: int) -> float:
         """Return the temperature of the die in degC, as its own sensor measures it."""

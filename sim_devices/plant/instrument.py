@@ -64,6 +64,7 @@ class Instrument:
         self._rng = stream(seed, "instrument.noise")
         self._nodes, self._parts = np.zeros((BLOCK_MS + 1, 18)), np.zeros((BLOCK_MS, 6))
         self._noise, self._slow = np.zeros((_BLOCK_STEPS, NOISES)), np.zeros((BLOCK_MS, SLOW_NOISES))
+        self._block = self._nodes, self._parts, self._noise, self._slow
         self._part = np.zeros(6)
         keep = None if config.truth_s is None else 1 + math.ceil(config.truth_s * 1000 / _CHUNK_ROWS)
         self._chunks: deque[Array] = deque(maxlen=keep)
@@ -99,12 +100,8 @@ class Instrument:
             self._row = advance(
                 self._plant,
                 self._state,
-                self._nodes,
-                self._parts,
-                self._noise,
-                self._slow,
-                self._in_block,
-                stop,
+                self._block,
+                (self._in_block, stop),
                 self._chunk,
                 self._row,
             )

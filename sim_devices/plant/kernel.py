@@ -128,7 +128,7 @@ def sense(p, s, noise):
     attitude(p["frame"], pose[3:6], c)
     body_rates(pose[3:6], pose[9:12], pose[15:18], omega, alpha)
     for i in range(3):
-        specific_force(c, pose[12:15], p["gravity"], p["arm_m"][i], omega, alpha, f[i])
+        specific_force((c, pose[12:15], omega, alpha), p["gravity"], p["arm_m"][i], f[i])
     for i in range(6):
         a = p["accelerometer"][i]
         v = accelerometer_V(a, f[a["location"]], s["supply_V"], s["temperature_C"])
@@ -214,14 +214,17 @@ def begin(plant, state, node, part, truth):
 
 
 @kernel
-def advance(plant, state, nodes, parts, noise, slow, first, stop, truth, row):
-    """Steps ``first`` to ``stop`` (excluded) of a block of n milliseconds; the next free row of ``truth``.
+def advance(plant, state, block, steps, truth, row):
+    """Run ``steps`` (first, stop) of a block of n milliseconds, without ``stop``. Return the next free row of
+    ``truth``.
 
-    ``nodes`` (n + 1, 18): the hand, node 0 at the block's start. ``parts`` (n, 6). ``noise`` (8 n, NOISES) and ``slow``
-    (n, SLOW_NOISES) standard normal (or zeros: a noiseless twin). ``plant`` and ``state`` are one-row structured
-    arrays PLANT, STATE; ``state`` and ``truth`` are written.
+    ``block``: nodes (n + 1, 18) of the hand, node 0 at the block's start; its parts (n, 6); noise (8 n, NOISES) and
+    slow noise (n, SLOW_NOISES), standard normal (or zeros: a noiseless twin). ``plant`` and ``state`` are one-row
+    structured arrays PLANT, STATE; ``state`` and ``truth`` are written.
     """
     p, s = plant[0], state[0]
+    nodes, parts, noise, slow = block
+    first, stop = steps
     for j in range(first, stop):
         ms, k = j // STEPS_PER_MS, j % STEPS_PER_MS
         if k == 0:

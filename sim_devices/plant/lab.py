@@ -51,13 +51,14 @@ class LabError(BenchError):
 
 
 @kernel
-def drive_stack(params, state, volts, temperature_C, steps_per_sample, stroke, terminal_V):
-    """Drive one stack with held demands ``volts`` (n,). Return ``stroke`` (n,) m and ``terminal_V`` (n,) at each
+def drive_stack(params, state, volts, temperature_C, steps_per_sample, out):
+    """Drive one stack with held demands ``volts`` (n,). ``out``: its stroke (n,) m and its voltage (n,) at each
     sample's time.
 
     Sample i is taken when its demand is given, so the answer to demand i shows from sample i + 1 on.
     """
     p, s = params[0], state[0]
+    stroke, terminal_V = out
     for i in range(volts.shape[0]):
         stroke[i] = s["mode"][0]
         terminal_V[i] = s["stack_V"]
@@ -117,6 +118,7 @@ def measure_piezo(
     rate_hz: float,
     seconds: float,
     amplitude_V: float,
+    *,
     twin: FileTwin | None = None,
 ) -> tuple[dict[str, Array], str]:
     """Return the columns (n,) of the recording and its ``recording.toml``. A corrected piezo ``twin`` may replace the
@@ -153,7 +155,7 @@ def measure_volts(
         unit = stack_unit(config.stack, config.unit, axis)
         params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
         stroke, terminal_V = np.empty(len(volts)), np.empty(len(volts))
-        drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), stroke, terminal_V)
+        drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), (stroke, terminal_V))
     hiss = stream(config.seed, f"lab.piezo.{axis}.{noise}").standard_normal(len(volts))
     columns = {
         "command_V": volts,
@@ -330,7 +332,7 @@ def main(arguments: list[str] | None = None) -> int:
         if given.what == "piezo" and given.profile == "set":
             for profile, rate_hz, seconds, share in CALIBRATION_SET:
                 columns, descriptor = measure_piezo(
-                    config, given.axis, profile, rate_hz, seconds, share * given.amplitude_V, twin
+                    config, given.axis, profile, rate_hz, seconds, share * given.amplitude_V, twin=twin
                 )
                 write_recording(given.out / f"{profile}-{rate_hz:g}Hz", columns, descriptor)
             sys.stderr.write(f"{given.out}: {len(CALIBRATION_SET)} recordings\n")
@@ -343,7 +345,7 @@ def main(arguments: list[str] | None = None) -> int:
             columns, descriptor = measure_motion(config, given.what, given.seconds)
         elif given.what == "piezo":
             columns, descriptor = measure_piezo(
-                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V, twin
+                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V, twin=twin
             )
         else:
             columns, descriptor = measure_tumble(config, given.positions, given.seconds)

@@ -86,9 +86,12 @@ def sense_at(p, s, node, noise, slow):
 
 
 @kernel
-def record(plant, state, nodes, noise, slow, first, held, analog, magnet):
-    """``analog`` (n, 8) and ``magnet`` (n, 3) V as the converters give them, from hand nodes (n, 18)."""
+def record(plant, state, block, first, held, out):
+    """``out``: analog (n, 8) and magnetic (n, 3) V as the converters give them. ``block``: hand nodes (n, 18), noise
+    and slow noise."""
     p, s = plant[0], state[0]
+    nodes, noise, slow = block
+    analog, magnet = out
     for k in range(nodes.shape[0]):
         sense_at(p, s, nodes[k], noise[k], slow[k])
         outputs(p, s, 0.0)
@@ -123,7 +126,7 @@ def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[
         part = slice(first, min(n, first + BLOCK))
         count = part.stop - first
         noise, slow = rng.standard_normal((count, NOISES)), rng.standard_normal((count, SLOW_NOISES))
-        record(plant, state, nodes[part], noise, slow, first, held, analog[part], magnet[part])
+        record(plant, state, (nodes[part], noise, slow), first, held, (analog[part], magnet[part]))
     columns = {"analog_V": analog, "magnetometer_V": magnet}
     if kind == "shake":
         columns["acceleration_m_s2"] = nodes[:, 12:15]

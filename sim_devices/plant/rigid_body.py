@@ -44,11 +44,13 @@ def body_rates(angles, rates, accelerations, omega, alpha):
 
 
 @kernel
-def specific_force(c, acceleration, gravity, arm, omega, alpha, f):
-    """``f`` (3,) body, m/s^2, at ``arm`` (body, m) from a point with the world ``acceleration``.
+def specific_force(moves, gravity, arm, f):
+    """Fill ``f`` (3,) body, m/s^2, at ``arm`` (body, m) from a point. ``moves``: attitude C, the point's world
+    acceleration, rate omega and angular acceleration alpha.
 
     f = C^T (a - g) + alpha x r + omega x (omega x r), g = (0, 0, -gravity).
     """
+    c, acceleration, omega, alpha = moves
     ax, ay, az = acceleration[0], acceleration[1], acceleration[2] + gravity
     wx, wy, wz = omega[0], omega[1], omega[2]
     rx, ry, rz = arm[0], arm[1], arm[2]

@@ -58,10 +58,11 @@ def rate_matrix(p: Array) -> Array:
 
 @kernel
 def turned_gravity(
-    raw: Array, bounds: NDArray[np.int64], bias: Array, matrix: Array, dt_s: float, up: Array, out: Array
+    raw: Array, bounds: NDArray[np.int64], bias: Array, unit: tuple[Array, float], up: Array, out: Array
 ) -> None:
     """Fill ``out`` (n, 3) with ``up`` (n, 3) of the start of a turn, as the body sees it at its end; ``raw`` (m, 3)
-    counts."""
+    counts. ``unit``: matrix from counts to rad/s, and the time between samples in s."""
+    matrix, dt_s = unit
     q, c, rate, before = np.empty(4), np.empty((3, 3)), np.empty(3), np.empty(3)
     for k in range(len(bounds)):
         q[:] = 0.0
@@ -133,7 +134,7 @@ def fit_gyroscope(
     unit = np.concatenate([np.ones(6), np.full(3, size)])
 
     def residual(x: Array) -> Array:
-        turned_gravity(raw, bounds, bias, rate_matrix(x * unit), 1.0 / rate_hz, start, out)
+        turned_gravity(raw, bounds, bias, (rate_matrix(x * unit), 1.0 / rate_hz), start, out)
         return (out - end).ravel()
 
     fit = least_squares(residual, np.concatenate([np.zeros(6), np.ones(3)]), method="lm", x_scale="jac")
@@ -164,7 +165,7 @@ def _first_scale(raw: Array, bounds: NDArray[np.int64], bias: Array, start: Arra
     out = np.empty_like(start)
     best, least = size, np.inf
     for scale in size * np.geomspace(0.05, 10.0, 120):
-        turned_gravity(raw, bounds, bias, scale * np.eye(3), dt_s, start, out)
+        turned_gravity(raw, bounds, bias, (scale * np.eye(3), dt_s), start, out)
         miss = float(np.sum(np.abs(out - end)))
         if miss < least:
             best, least = float(scale), miss

@@ -27,9 +27,10 @@ _FIELD = LAYOUT.start("magnetometer")
 
 
 @kernel
-def calibrate_rows(counts, field_V, params, smoothed, frame, readings, field):
-    """``readings`` (n, N) m/s^2, ``field`` (n, 3) uT from counts (n, 8), volts (n, 3); the first bad row or -1."""
+def calibrate_rows(counts, field_V, params, smoothed, frame, out):
+    """``out``: readings (n, N) m/s^2, field (n, 3) uT from counts (n, 8), volts (n, 3); the first bad row or -1."""
     p = params[0]
+    readings, field = out
     for k in range(len(counts)):
         for i in range(counts.shape[1]):
             frame[COUNTS + i] = counts[k, i]
@@ -72,7 +73,7 @@ def instrument_readings(log: SensorLog, config: SensingConfig) -> tuple[Array, A
             counts, volts = log.matrix(analog) / config.lsb_V, log.matrix(magnet)
             readings, field = np.zeros((len(counts), len(config.channels))), np.zeros((len(counts), 3))
             frame, smoothed = LAYOUT.new_frame(), np.full(2, np.nan)
-            bad = calibrate_rows(counts, volts, calibration_params(config), smoothed, frame, readings, field)
+            bad = calibrate_rows(counts, volts, calibration_params(config), smoothed, frame, (readings, field))
             if bad >= 0:
                 raise InputError(f"{log.path}: sample {bad}: the supply is missing (input {config.supply_channel})")
             return readings, field

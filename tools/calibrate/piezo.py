@@ -97,7 +97,10 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
         answer = Answers(mechanism, mechanism, more_s, dt)
     else:
         answer = Answers(dynamics.mechanism(dt, held), dynamics, 0.0, dt)
-    return _report(given, pieces, shape, axes, solution, unseen, dynamics, parts, notes, partials, answer)
+    return _report(
+        given, pieces, shape, axes, solution, unseen,
+        dynamics=dynamics, parts=parts, notes=notes, partials=partials, answer=answer,
+    )  # fmt: skip
 
 
 def _check(recording: Recording, dt: float) -> None:
@@ -229,6 +232,7 @@ def _report(
     axes: Axes,
     solution: Solution,
     unseen: Array,
+    *,
     dynamics: Dynamics,
     parts: tuple[tuple[str, float, bool], ...],
     notes: list[str],

@@ -41,10 +41,11 @@ def forward_kernel(volts: Array, rate: Array, plays: Array, creep: Array, stack:
 
 @kernel
 def inverse_kernel(
-    wanted: Array, tick_hz: float, limits: Array, plays: Array, creep: Array, stack: Record, out: Array
+    wanted: Array, tick_hz: float, limits: Array, memory: tuple[Array, Array], stack: Record, out: Array
 ) -> tuple[int, int, int]:
     """Invert the model for a wanted displacement (n,) in um. ``limits`` are low V, high V, slew V per tick, V at the
-    start."""
+    start; ``memory`` are the plays and the creep."""
+    plays, creep = memory
     slopes = np.empty(len(plays))
     singular, voltage, slew = 0, 0, 0
     before_V = limits[3]
@@ -93,6 +94,7 @@ def simulate(stack: StackConfig, drive_V: Array, tick_hz: float = 1000.0, high_V
 def command(
     stack: StackConfig,
     wanted_um: Array,
+    *,
     neutral_V: float = 50.0,
     tick_hz: float = 1000.0,
     low_V: float = 0.0,
@@ -104,7 +106,7 @@ def command(
     creep = np.zeros(len(params["creep_share"][0]))
     out = np.empty(len(wanted_um))
     limits = np.array([low_V, high_V, slew_V_per_s / tick_hz, neutral_V])
-    counts = inverse_kernel(rest + wanted_um * UM, tick_hz, limits, plays, creep, params[0], out)
+    counts = inverse_kernel(rest + wanted_um * UM, tick_hz, limits, (plays, creep), params[0], out)
     return Commanded(out, *map(int, counts))
 
 
@@ -141,7 +143,7 @@ def predict(fit: PiezoFit, share: float = 0.8) -> Prediction:
     rest = simulate(stack, np.array([fit.neutral_V]), fit.tick_hz, fit.high_V)[0]
     low, high = fit.span_um
     wanted = wanted + np.minimum(1.0, np.arange(len(wanted)) / (0.3 * fit.tick_hz)) * (0.5 * (low + high) - rest)
-    asked = command(stack, wanted, fit.neutral_V, fit.tick_hz, fit.low_V, fit.high_V)
+    asked = command(stack, wanted, neutral_V=fit.neutral_V, tick_hz=fit.tick_hz, low_V=fit.low_V, high_V=fit.high_V)
     z0 = simulate(stack, np.concatenate([[fit.neutral_V], asked.drive_V]), fit.tick_hz, fit.high_V)
     scatter = np.zeros(len(wanted))
     for other in fit.others:

@@ -86,6 +86,7 @@ def _exact(
     samples: int,
     noise: float,
     missing: tuple[str, ...],
+    *,
     limits: tuple[str, ...],
     check: NormCheck | None = None,
 ) -> QuickResult:
@@ -201,7 +202,7 @@ def turn(raw: Array) -> QuickResult:
         np.float64
     )  # reading up and down = bias +- scale
     noise = float(np.max(spread[axes])) / np.sqrt(2.0)
-    return _exact("turn", parameters, design, len(raw), noise, missing, tuple(limits), check)
+    return _exact("turn", parameters, design, len(raw), noise, missing, limits=tuple(limits), check=check)
 
 
 def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float = 2.0) -> QuickResult:
@@ -225,7 +226,9 @@ def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float 
         )
     part = raw[first:last]
     limits = ("scale: 0 g does not show it", "drag of the air and tumbling: they look like bias")
-    return _exact("fall", _one_pose(part), np.eye(3), len(part), float(part.std(axis=0).max()), tuple(missing), limits)
+    return _exact(
+        "fall", _one_pose(part), np.eye(3), len(part), float(part.std(axis=0).max()), tuple(missing), limits=limits
+    )
 
 
 def flat(raw: Array, counts_per_g: float, up: str) -> QuickResult:
@@ -254,4 +257,6 @@ def flat(raw: Array, counts_per_g: float, up: str) -> QuickResult:
         f"tilt of the surface: 1 degree looks like a bias of {np.sin(np.radians(1.0)) * counts_per_g:.3g} in {level}",
         f"scale: 1 % of it looks like a bias of {0.01 * counts_per_g:.3g} in {'xyz'[axis]}",
     )
-    return _exact("flat", _one_pose(part), np.eye(3), len(part), noise, missing_poses(direction[None, :]), limits)
+    return _exact(
+        "flat", _one_pose(part), np.eye(3), len(part), noise, missing_poses(direction[None, :]), limits=limits
+    )

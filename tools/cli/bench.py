@@ -20,6 +20,7 @@ from tools.prepare import prepare
 
 
 def bench(
+    *,
     bench: BenchOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes any free one.")] = 8750,
     listen: Annotated[

@@ -65,6 +65,7 @@ def print_parameters(title: str, parameters: dict, notes: list[str], json_file: 
 
 
 def accelerometer(
+    *,
     recording: Annotated[
         Path,
         typer.Argument(metavar="RECORDING", help="Recording (folder, .toml, or a data file) with three columns."),
@@ -105,7 +106,7 @@ def accelerometer(
     with clear_errors():
         check_writable(json_file, out)
         if method is Method.STAGE:
-            _stage(recording, three(columns), model, drift, rate_hz, out, json_file)
+            _stage(recording, three(columns), model, drift, rate_hz=rate_hz, out=out, json_file=json_file)
             return
         log = load_log(recording, rate_hz)
         raw, rate = log.matrix(three(columns)), log.need_rate()
@@ -145,6 +146,7 @@ def _stage(
     columns: tuple[str, str, str],
     model: Model,
     drift: OnDrift,
+    *,
     rate_hz: float | None,
     out: Path | None,
     json_file: str | None,

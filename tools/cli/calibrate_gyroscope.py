@@ -15,6 +15,7 @@ from tools.output import check_writable, write_calibration, write_json
 
 
 def gyroscope(
+    *,
     recording: Annotated[
         Path, typer.Argument(metavar="LOG", help="Still poses with hand turns between: both sensors' columns.")
     ],

@@ -202,6 +202,7 @@ def latency(
 
 
 def ramp(
+    *,
     bench: BenchOption = None,
     arm: Annotated[bool, typer.Option("--arm", help="Allow motion; without it nothing is moved.")] = False,
     channel: Annotated[list[int] | None, typer.Option(min=1, help="Output, from 1; default all.")] = None,

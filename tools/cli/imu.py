@@ -20,6 +20,7 @@ from tools.terminal import task_name
 
 
 def imu(
+    *,
     recording: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[RECORDING]...", help="Motionless recordings; more than one for other temperatures."),

@@ -50,6 +50,7 @@ MOST_SHARED = 1_000_000
 
 @app.command()
 def diagnose(
+    *,
     recordings: RecordingsArgument,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report with pictures.")] = None,
@@ -108,7 +109,7 @@ def diagnose(
         if is_folder_of_recordings(recording):
             if html is not None:
                 raise InputError(f"--html is for one recording; {recording} is a folder of them: use --out FOLDER")
-            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask)
+            _diagnose_folder(recording, json_file, out, held_out=held_out, seed=seed, jobs=processes, dask=dask)
             return
         if dask is not None:
             raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
@@ -162,7 +163,7 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 
 
 def _diagnose_folder(
-    folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None,
+    folder: Path, json_file: str | None, out: Path | None, *, held_out: float, seed: int, jobs: int, dask: str | None,
 ) -> None:  # fmt: skip
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
@@ -193,6 +194,7 @@ def _diagnose_folder(
 
 @app.command()
 def new(
+    *,
     data: Annotated[Path, typer.Argument(metavar="DATA", help="A data file: .csv, .txt, .npz, .mat and others.")],
     twin: Annotated[str, typer.Option("--twin", metavar="KIND", help="The kind of twin; default: guessed.")] = "",
     out: Annotated[
@@ -300,6 +302,7 @@ def cut(
 
 @app.command()
 def apply(
+    *,
     recording: RecordingArgument,
     report: Annotated[
         Path, typer.Argument(metavar="REPORT.json", help="Report that 'diagnose --json' wrote for the recording.")

@@ -31,6 +31,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def plan(
+    *,
     twin: Annotated[
         Path, typer.Argument(metavar="TWIN", help="A recording, a recording.toml without data, or a twin file.")
     ],
@@ -92,11 +93,13 @@ def plan(
             print_prospect(found, say)
             write_json(found.to_json(), json_file)
             return
-        _plan_for(twin, read_report(report), asked, out, bench is not None, stack, json_file)
+        _plan_for(
+            twin, read_report(report), asked, out=out, on_bench=bench is not None, stack=stack, json_file=json_file
+        )
 
 
 def _plan_for(
-    twin: Path, report: dict[str, Any], asked: Any, out: Path | None, on_bench: bool, stack: int | None,
+    twin: Path, report: dict[str, Any], asked: Any, *, out: Path | None, on_bench: bool, stack: int | None,
     json_file: str | None,
 ) -> None:  # fmt: skip
     from rich.progress import BarColumn, Progress, TextColumn

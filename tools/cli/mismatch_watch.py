@@ -29,6 +29,7 @@ def check_rate(false_alarms_per_hour: float) -> None:
 
 
 def watch(
+    *,
     twin: Annotated[
         Path, typer.Argument(metavar="TWIN", help="Corrected twin that 'apply' wrote: .toml, .py or .fmu.")
     ],

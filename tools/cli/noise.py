@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 def noise(
+    *,
     recording: Annotated[
         Path,
         typer.Argument(metavar="RECORDING", help="Recording of a sensor at rest: folder, .toml, or a data file."),

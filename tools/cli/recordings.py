@@ -42,6 +42,7 @@ def recover(
 
 
 def export(
+    *,
     file: Annotated[Path, typer.Argument(metavar="RUN", help="A recording (.mcap).")],
     to: Annotated[
         Path | None,

@@ -49,6 +49,7 @@ SETTLE_S = 2.0
 
 
 def run(
+    *,
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="Time of the run after arming, in s.")] = 10.0,
     virtual: Annotated[

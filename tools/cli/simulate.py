@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 def simulate_command(
+    *,
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=3.0, max=86_400.0, help="Simulated time after arming.")] = 60.0,
     hand: Annotated[

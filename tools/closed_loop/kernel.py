@@ -83,22 +83,18 @@ def command(s: Record, wires: Record, frame: Array) -> None:
 @kernel
 def closed_loop(
     n: int,
-    plant: Record,
-    state: Record,
-    nodes: Array,
-    parts: Array,
-    noise: Array,
-    slow: Array,
-    truth: Array,
+    world: tuple[Record, Record, Array],
+    block: tuple[Array, Array, Array, Array],
     row: int,
-    wire: Record,
     frames: Array,
-    memory: Record,
+    loop: tuple[Record, Record],
 ) -> int:
-    """``n`` ticks of 1 ms from the start of a block (``PlantBlocks``); the next free row of ``truth``.
+    """Run ``n`` ticks of 1 ms from the start of a ``block`` (``PlantBlocks``). Return the next free row of the truth.
 
-    ``frames`` (n, Layout.size) takes the finished frames, or is empty (0, ...) when nobody wants them.
+    ``world``: plant, state and truth; ``loop``: the wires and the firmware's memory. ``frames`` (n, Layout.size) takes
+    the finished frames, or is empty (0, ...) when nobody wants them.
     """
+    (plant, state, truth), (wire, memory) = world, loop
     s, wires, frame = state[0], wire[0], memory[0].frame
     for k in range(n):
         first = k * STEPS_PER_MS
@@ -108,11 +104,11 @@ def closed_loop(
             for i in range(len(frame)):
                 frames[k, i] = frame[i]
         arrives = first + wires.delay_steps
-        row = advance(plant, state, nodes, parts, noise, slow, first, arrives, truth, row)
+        row = advance(plant, state, block, (first, arrives), truth, row)
         if wires.tick >= wires.armed_tick:
             command(s, wires, frame)
             if int(frame[CLIP]) & ~CLIP_YIELD:
                 wires.clipped += 1
-        row = advance(plant, state, nodes, parts, noise, slow, arrives, first + STEPS_PER_MS, truth, row)
+        row = advance(plant, state, block, (arrives, first + STEPS_PER_MS), truth, row)
         wires.tick += 1
     return row

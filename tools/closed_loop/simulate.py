@@ -97,8 +97,7 @@ def _measure_offset(world: PlantBlocks) -> tuple[Array, int]:
 
 def _advance(world: PlantBlocks, start_ms: int, stop_ms: int) -> None:
     steps = start_ms * STEPS_PER_MS, stop_ms * STEPS_PER_MS
-    arrays = world.plant, world.state, world.nodes, world.parts, world.noise, world.slow
-    advance(*arrays, *steps, world.truth, start_ms + 1)
+    advance(world.plant, world.state, world.block, steps, world.truth, start_ms + 1)
 
 
 def simulate(
@@ -148,10 +147,8 @@ def simulate(
         world.next_block()
         n = min(ms, ticks - done)
         part = frames[:n] if on_block is not None else frames[done : done + n]
-        row = closed_loop(
-            n, world.plant, world.state, world.nodes, world.parts, world.noise, world.slow, world.truth, row,
-            wire, part, stages.memory,
-        )  # fmt: skip
+        arrays = world.plant, world.state, world.truth
+        row = closed_loop(n, arrays, world.block, row, part, (wire, stages.memory))
         done += n
         if on_block is not None:
             on_block(world.truth[ms + 1 : row], part)

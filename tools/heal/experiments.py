@@ -45,7 +45,7 @@ def twin_of_stack(lab: Lab, axis: int, jobs: int = 1) -> StackTwin:
     profile, rate_hz = PROFILES[0]
     replaced = in_place(lab.config, lab.bench.path, axis, None)
     first = home / "first"
-    write_recording(first, *measure_piezo(lab.config, axis, profile, rate_hz, CHECK_S, AMPLITUDE_V, replaced))
+    write_recording(first, *measure_piezo(lab.config, axis, profile, rate_hz, CHECK_S, AMPLITUDE_V, twin=replaced))
     report = diagnose(load(first), jobs=jobs).to_json()
     groups = groups_of(report)
     split: tuple[str, ...] = ()

@@ -89,7 +89,7 @@ def _stack_configs(bench: BenchFile) -> Sequence[StackConfig]:
 
 def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: float, volts: float) -> dict[str, Any]:
     twin = in_place(lab.config, lab.bench.path, axis, None)
-    return measure_piezo(lab.config, axis, profile, rate_hz, seconds, volts, twin)[0]
+    return measure_piezo(lab.config, axis, profile, rate_hz, seconds, volts, twin=twin)[0]
 
 
 def compare_stacks(lab: Lab) -> Comparison:
@@ -134,7 +134,7 @@ def identify_stacks(lab: Lab) -> Path:
         recordings: list[Recording] = []
         for profile, rate_hz, seconds, share in CALIBRATION_SET:
             twin = in_place(lab.config, lab.bench.path, axis, None)
-            columns, text = measure_piezo(lab.config, axis, profile, rate_hz, seconds, share * AMPLITUDE_V, twin)
+            columns, text = measure_piezo(lab.config, axis, profile, rate_hz, seconds, share * AMPLITUDE_V, twin=twin)
             folder = lab.folder / f"stack{axis + 1}" / f"{profile}-{rate_hz:g}Hz-{share:g}"
             write_recording(folder, columns, text)
             recordings.append(load(folder))

@@ -9,13 +9,14 @@ from scipy.signal import butter, sosfiltfilt
 from firmware_py.actuation import yielding
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.actuation.yielding import YIELD_STATE, shrink_core, yield_rest
+from firmware_py.actuation.yielding import Swing, YieldLimits, YieldState, shrink_core, yield_rest
 from firmware_py.frame import CLIP, CLIP_WORKSPACE, CLIP_YIELD, CONFIDENCE, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
-from firmware_py.records import attributes
+from firmware_py.records import attributes, new
 from tests.unit.pure_python import without_compiler
 
 LOW, HIGH = np.full(3, -7e-6), np.full(3, 7e-6)
 KEEP = float(np.exp(-1.0 / 2000.0))
+LIMITS = YieldLimits(LOW, HIGH, KEEP, 1.2, 1)
 BAND = butter(4, [8.0, 12.0], btype="band", fs=1000.0, output="sos")
 
 
@@ -79,21 +80,21 @@ def test_the_wish_has_no_jump_when_the_swing_begins() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_is_let_through_fits_whatever_comes(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    state = np.zeros(1, YIELD_STATE)
+    state = new(YieldState)
     for _ in range(400):
         core = rng.uniform(-3e-6, 3e-6, 3)
         stroke = core + rng.standard_normal(3) * 10.0 ** rng.uniform(-6.5, -4.0)
         wanted = stroke.copy()
-        held = yield_rest(stroke, core, LOW, HIGH, KEEP, state[0])
+        held = yield_rest(Swing(stroke, core), state[0], LIMITS)
         assert np.all((stroke >= LOW - 1e-18) & (stroke <= HIGH + 1e-18))
         assert held == bool(np.any(stroke != wanted))
 
 
 def test_what_has_no_inverse_is_left_alone_and_not_remembered() -> None:
-    state = np.zeros(1, YIELD_STATE)
+    state = new(YieldState)
     stroke = np.array([np.nan, 0.0, 0.0])
-    assert not yield_rest(stroke, np.zeros(3), LOW, HIGH, KEEP, state[0])
-    assert state[0].tobytes() == np.zeros(1, YIELD_STATE)[0].tobytes()
+    assert not yield_rest(Swing(stroke, np.zeros(3)), state[0], LIMITS)
+    assert state[0].tobytes() == new(YieldState)[0].tobytes()
 
 
 TIMES = np.arange(4000) / 1000.0
@@ -101,10 +102,10 @@ TIMES = np.arange(4000) / 1000.0
 
 def shrunk(cores: np.ndarray, overdrive: float, tilts: bool = True) -> np.ndarray:
     """What is let through of ``cores`` (n, 3), m of stroke; what is wanted beside them stays."""
-    state, out = np.zeros(1, YIELD_STATE), cores.copy()
+    state, out = new(YieldState), cores.copy()
     for core in out:
         stroke = core + 1e-6
-        shrink_core(stroke, core, LOW, HIGH, overdrive, int(tilts), KEEP, state[0])
+        shrink_core(Swing(stroke, core), state[0], YieldLimits(LOW, HIGH, KEEP, overdrive, int(tilts)))
         np.testing.assert_allclose(stroke - core, 1e-6, atol=1e-18)
     return out
 
@@ -150,18 +151,18 @@ def test_a_tilt_beyond_the_stroke_is_a_smaller_sine_unless_it_may_be_clipped(til
 def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     rows = [(c + rng.standard_normal(3) * 1e-5, c) for c in rng.uniform(-3e-6, 3e-6, (50, 3))]
-    fast, slow = np.zeros(1, YIELD_STATE), np.zeros(1, YIELD_STATE)
+    fast, slow = new(YieldState), new(YieldState)
     compiled = [row[0].copy() for row in rows]
-    flags = [yield_rest(s, r[1], LOW, HIGH, KEEP, fast[0]) for s, r in zip(compiled, rows, strict=True)]
+    flags = [yield_rest(Swing(s, r[1]), fast[0], LIMITS) for s, r in zip(compiled, rows, strict=True)]
     without_compiler(monkeypatch)
     for (stroke, core), found, flag in zip(rows, compiled, flags, strict=True):
-        assert yielding.yield_rest(stroke, core, LOW, HIGH, KEEP, attributes(slow)[0]) == flag
+        assert yielding.yield_rest(Swing(stroke, core), attributes(slow)[0], LIMITS) == flag
         np.testing.assert_allclose(stroke, found, atol=1e-18)
-    fast, slow = np.zeros(1, YIELD_STATE), np.zeros(1, YIELD_STATE)
+    fast, slow = new(YieldState), new(YieldState)
     for k, core in enumerate(rng.uniform(-9e-6, 9e-6, (50, 3))):
         found, stroke = core.copy(), core + 1e-6
         monkeypatch.undo()
-        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, 1, KEEP, fast[0])
+        flag = shrink_core(Swing(stroke.copy(), found), fast[0], LIMITS)
         without_compiler(monkeypatch)
-        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, 1, KEEP, attributes(slow)[0]) == flag, k
+        assert yielding.shrink_core(Swing(stroke, core), attributes(slow)[0], LIMITS) == flag, k
         np.testing.assert_allclose(core, found, atol=1e-18)

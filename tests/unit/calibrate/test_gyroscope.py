@@ -72,7 +72,7 @@ def test_too_few_turns_are_refused() -> None:
 def test_the_integration_is_the_closed_form_for_a_steady_turn() -> None:
     rate = np.tile([0.3, -0.5, 0.8], (201, 1))
     up, out = np.array([[0.0, 0.6, 0.8]]), np.empty((1, 3))
-    arguments = (np.array([[0, 201]]), np.zeros((1, 3)), np.eye(3), 0.01, up, out)
+    arguments = (np.array([[0, 201]]), np.zeros((1, 3)), (np.eye(3), 0.01), up, out)
     turned_gravity(rate, *arguments)
     np.testing.assert_allclose(out[0], Rotation.from_rotvec(2.0 * rate[0]).inv().apply(up[0]), atol=1e-12)
     compiled = out.copy()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from firmware_py.control.plausibility import (
-    NO_SLOPE,
     PAIRS,
     PlausibilityLimits,
     ScanCheck,
@@ -14,6 +13,7 @@ from firmware_py.control.plausibility import (
     turns_of_pairs,
 )
 from firmware_py.frame import ACCELEROMETER, LAYOUT
+from firmware_py.records import attributes
 from firmware_py.sensing.config import SensingConfig
 
 LSB_V = 5.0 / 32768.0
@@ -208,14 +208,15 @@ def test_kernel_and_python_agree():
     rows[50, 2] += 2000
     rows[200:, 5] = rows[200, 5]
     results, counted = [], []
-    for function in (check_counts, check_counts.py_func):  # type: ignore[attr-defined]
-        last, same = np.zeros(8, dtype=np.int64), np.full(8, -1, dtype=np.int64)
-        slope, odd = np.full(8, NO_SLOPE), np.zeros(8, dtype=np.int64)
-        together = np.array([NO_SLOPE, 6])
-        results.append(
-            [function(row, 6, last, same, slope, odd, together, 1, 197, 33, 26, 2621, 30147, 20) for row in rows]
-        )
-        counted.append(odd.tolist())
+    for function, view in ((check_counts, np.asarray), (check_counts.py_func, attributes)):  # type: ignore[attr-defined]
+        memory = ScanCheck(PlausibilityLimits(), 5.0 / 32768, range(8), [""] * 8).memory
+        state, params = view(memory.state)[0], view(memory.params)[0]
+        found = []
+        for k, row in enumerate(rows):
+            state["counts"] = row
+            found.append(function(k, state, params))
+        results.append(found)
+        counted.append(state["odd"].tolist())
     assert results[0] == results[1]
     assert counted[0] == counted[1]
     assert {value for value in results[0] if value} == {16 * 2 + 2, 16 * 5 + 3}

@@ -75,7 +75,7 @@ def test_one_slew_rate_holds_both_ways() -> None:
     assert effect.apply is not None
     y = effect.apply(x, context(x.size), np.array([5.0, 1e-6]), {})
     np.testing.assert_allclose(
-        y, slew(x, 5.0 * DT / SUBSTEPS, 5.0 * DT / SUBSTEPS, 1.0, np.array([0]), SUBSTEPS, False), atol=1e-9
+        y, slew(x, (5.0 * DT / SUBSTEPS, 5.0 * DT / SUBSTEPS), 1.0, np.array([0]), SUBSTEPS, False), atol=1e-9
     )
     assert np.max(np.abs(np.diff(y))) == pytest.approx(5.0 * DT)
 

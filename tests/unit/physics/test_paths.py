@@ -129,9 +129,9 @@ def test_hard_and_soft_limits() -> None:
 
 def test_slew_of_a_step() -> None:
     x = np.concatenate([np.zeros(1), np.ones(50)])
-    y = slew(x, 0.05, 0.1, 1.0, ONE, 1, False)
+    y = slew(x, (0.05, 0.1), 1.0, ONE, 1, False)
     np.testing.assert_allclose(y, np.minimum(0.1 * np.arange(51), 1.0), atol=1e-12)
-    back = slew(-x, 0.05, 0.1, 1.0, ONE, 1, False)
+    back = slew(-x, (0.05, 0.1), 1.0, ONE, 1, False)
     np.testing.assert_allclose(back, -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
 
 

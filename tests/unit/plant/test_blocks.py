@@ -20,9 +20,9 @@ def test_same_draws_same_world() -> None:
     row = 1
     for _ in range(2):
         world.next_block()
-        arrays = world.plant, world.state, world.nodes, world.parts, world.noise, world.slow
         for first in range(0, 32 * STEPS_PER_MS, 40):  # pieces, as a loop with a command in the middle
-            row = advance(*arrays, first, min(first + 40, 32 * STEPS_PER_MS), world.truth, row)
+            steps = first, min(first + 40, 32 * STEPS_PER_MS)
+            row = advance(world.plant, world.state, world.block, steps, world.truth, row)
     instrument = Instrument(CONFIG, CONFIG.seed, SyntheticHand(CONFIG.hand, CONFIG.seed), unit=CONFIG.unit)
     instrument.advance_to(MS * 1_000_000)
     wanted, found = instrument.truth(), world.truth_columns(row)

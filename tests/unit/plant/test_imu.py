@@ -37,13 +37,13 @@ def test_compiled_kernels_and_their_python_twins() -> None:
     vectors = [rng.standard_normal(3) for _ in range(5)]
     turn = rotation((10.0, 20.0, 30.0))
     outs = [np.zeros(3) for _ in range(4)]
-    body_motion._felt(*vectors, turn, outs[0], outs[1])
-    body_motion._felt.py_func(*vectors, turn, outs[2], outs[3])
+    body_motion._felt(tuple(vectors[:4]), (vectors[4], turn), outs[0], outs[1])
+    body_motion._felt.py_func(tuple(vectors[:4]), (vectors[4], turn), outs[2], outs[3])
     assert outs[0] == pytest.approx(outs[2])
     assert outs[1] == pytest.approx(outs[3])
     a, b = np.ones((4, 3)), np.ones((4, 3))
     weights = (0.5, 0.2, 0.3, 0.1, 0.9, 0.01)
-    arguments = (turn, *vectors[:3], rng.standard_normal((3, 3)), *vectors[3:], 2.0)
+    arguments = (turn, *vectors[:3], rng.standard_normal((3, 3))), (*vectors[3:], 2.0)
     draw = rng.standard_normal(6)
     imu._triad_step(*arguments, a, draw, weights, outs[0])
     imu._triad_step.py_func(*arguments, b, draw, weights, outs[2])

@@ -185,8 +185,7 @@ def test_compiled_and_python_agree():
         unit._state[0]["demand_V"] = (55.0, 42.0, 50.5)
         truth = np.zeros((BLOCK_MS + 1, kernel.TRUTH_COLUMNS))
         begin(unit._plant, unit._state, unit._nodes[0], unit._part, truth[0])
-        arrays = unit._nodes, unit._parts, unit._noise, unit._slow
-        row = advance(unit._plant, unit._state, *arrays, 0, 24, truth, 1)
+        row = advance(unit._plant, unit._state, unit._block, (0, 24), truth, 1)
         assert row == 4
         stepped = unit._daq_V.copy(), unit._magnetometer_V.copy()
         outputs(unit._plant[0], unit._state[0], 5e-5)

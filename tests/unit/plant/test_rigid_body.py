@@ -63,7 +63,7 @@ def test_specific_force_is_the_second_derivative_of_the_point_less_gravity(t, ar
     arm = np.array(arm)
     c, omega, alpha = kernel_state(t)
     f = np.empty(3)
-    specific_force(c, origin(t, 2), GRAVITY, arm, omega, alpha, f)
+    specific_force((c, origin(t, 2), omega, alpha), GRAVITY, arm, f)
 
     def point(at):
         return origin(at) + world_from_body(at) @ arm
@@ -77,7 +77,7 @@ def test_specific_force_is_the_second_derivative_of_the_point_less_gravity(t, ar
 
 def test_at_rest_the_axis_that_points_up_reads_plus_g():
     f, zero = np.empty(3), np.zeros(3)
-    specific_force(np.eye(3), zero, GRAVITY, zero, zero, zero, f)
+    specific_force((np.eye(3), zero, zero, zero), GRAVITY, zero, f)
     assert f.tolist() == [0.0, 0.0, GRAVITY]
 
 
@@ -98,8 +98,8 @@ def test_compiled_and_python_agree():
     attitude.py_func(FRAME, angles(t), c2)
     body_rates.py_func(angles(t), angles(t, 1), angles(t, 2), omega2, alpha2)
     arm = np.array([0.01, 0.02, 0.03])
-    specific_force(c, origin(t, 2), GRAVITY, arm, omega, alpha, f)
-    specific_force.py_func(c, origin(t, 2), GRAVITY, arm, omega, alpha, g)
+    specific_force((c, origin(t, 2), omega, alpha), GRAVITY, arm, f)
+    specific_force.py_func((c, origin(t, 2), omega, alpha), GRAVITY, arm, g)
     q, q2 = np.empty(4), np.empty(4)
     quaternion(c, q)
     quaternion.py_func(c, q2)

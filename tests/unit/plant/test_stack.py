@@ -25,7 +25,7 @@ def run(config, demand_V, *, axis=0, seed=1, amplifier=None, temperature_C=25.0)
     amplifier = amplifier or AmplifierConfig()
     params, state = drive_channel(stack_unit(config, seed, axis), amplifier, STEP_S, 25.0)
     x, v = np.empty(len(demand_V)), np.empty(len(demand_V))
-    drive_stack(params, state, np.asarray(demand_V, dtype=float), temperature_C, 1, x, v)
+    drive_stack(params, state, np.asarray(demand_V, dtype=float), temperature_C, 1, (x, v))
     return x, v, params, state
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_py.records import attributes, new_record
+from firmware_py.records import attributes, new
 from firmware_py.sensing import fusion_filters
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
 from firmware_py.sensing.quaternion import from_matrix
@@ -204,8 +204,8 @@ def test_kernel_and_python_agree(method: str) -> None:
     config = FusionConfig(method=method)  # type: ignore[arg-type]
     compiled = Fusion(config, RATE_HZ)
     out = compiled.run(rate, force, field)
-    params = new_record(
-        fusion_filters.FUSION,
+    params = new(
+        fusion_filters.FusionParams,
         method=FILTERS.index(method),
         tau_s=config.tau_s,
         beta=config.beta,
@@ -214,11 +214,13 @@ def test_kernel_and_python_agree(method: str) -> None:
         ki=config.ki,
         align_samples=10,
     )
-    state = np.zeros(1, fusion_filters.FUSION_STATE)
+    state = new(fusion_filters.FusionState)
     s, p = attributes(state)[0], attributes(params)[0]
     fusion_filters.begin_fusion.py_func(s, p)
     for k in range(n):
-        fusion_filters.step_fusion.py_func(s, p, rate[k], force[k], field[k], 1.0 / RATE_HZ)
+        fusion_filters.step_fusion.py_func(
+            fusion_filters.FusionSample(rate[k], force[k], field[k], 1.0 / RATE_HZ), s, p
+        )
         np.testing.assert_allclose(s.quaternion, out[k], atol=1e-14)
 
 

@@ -14,10 +14,14 @@ READ = ("hal", "drivers", "firmware_py", "sim_devices", "tools", "benches", "ben
 NOT_JUDGED = ("benchmarks", "tests", "tools/research")
 KINDS = ("function", "class", "method", "property")
 # a framework finds these by a decorator
-DECORATORS = ["*command*", "*callback*", "*validator*", "*serializer*", "@overload*", "@pytest.fixture*", "*setter"]
+DECORATORS = [
+    "*command*", "*callback*", "*validator*", "*serializer*", "@overload*", "@pytest.fixture*", "*setter",
+    "@typeof_impl*", "@lower_constant*",
+]  # fmt: skip
 CALLED = [
     # by a framework: numba, IPython, matplotlib, pyserial, click
-    "AnyClone", "get_suitable_cache_subpath", "on_start", "_repr_*", "reset_input_buffer", "parse_args",
+    "AnyClone", "get_suitable_cache_subpath", "get_call_signatures", "on_start", "_repr_*", "reset_input_buffer",
+    "parse_args", "__setitem__",
     # by name: the list of commands, and the module that export writes
     "doctor", "emulate", "simulate_command", "curved", "legendre", "loop_with_speed",
     # by users: notebooks, tests of other projects, writers of drivers and twins

@@ -48,6 +48,8 @@ def test_each_leads_to_the_next():
     scans = ast.parse((ROOT / "firmware_py" / "control" / "scan_input.py").read_text(encoding="utf-8"))
     assert "read_scans" in called(scans)
     assert {"ScanInput", "task_rows"} <= called(micron)
-    assert {"sense_kernel", "estimate_kernel", "actuate_kernel"} <= called(nodes["step_kernel"])
+    stages = ast.parse((ROOT / "firmware_py" / "control" / "chain.py").read_text(encoding="utf-8"))
+    assert {"sense_kernel", "estimate_kernel", "actuate_kernel"} <= called(stages)  # which ``bind`` lets the step call
+    assert {"sense_entry", "estimate_entry", "actuate_entry"} <= called(nodes["step_kernel"])
     assert "write" in called(nodes["actuate"])
     assert {"sense", "estimate", "actuate"} <= called(table)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, ellip, sosfilt, sosfreqz
 
-from firmware_py.records import attributes, new_record
+from firmware_py.records import attributes, new
 from firmware_py.tremor.combiner import (
     combiner_displacement,
     combiner_params,
@@ -16,14 +16,14 @@ from firmware_py.tremor.combiner import (
 from firmware_py.tremor.config import TremorConfig, WflcConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
-from firmware_py.tremor.wflc import WFLC_STATE, wflc_params, wflc_step
+from firmware_py.tremor.wflc import WflcState, wflc_params, wflc_step
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 
 
 def locked_frequency_hz(signal: np.ndarray, config: WflcConfig) -> float:
     """WFLC frequency after ``signal``, mean of the last second."""
     params = wflc_params(config, RATE_HZ)
-    state = new_record(WFLC_STATE, omega=2 * np.pi * config.start_hz / RATE_HZ, miss=1.0)
+    state = new(WflcState, omega=2 * np.pi * config.start_hz / RATE_HZ, miss=1.0)
     tail = []
     for s in signal:
         wflc_step(s, state[0], params[0])

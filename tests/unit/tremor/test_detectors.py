@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import lfilter
 
 from firmware_py.frame import ALIGNING, DRIFT, JERK, LAYOUT, STALE, STATUS, TIP_ACCELERATION
-from firmware_py.records import attributes, new_record
+from firmware_py.records import attributes, new
 from firmware_py.tremor.detector_config import DetectorConfig
-from firmware_py.tremor.detectors import DETECT_STATE, Detectors, detect_step
+from firmware_py.tremor.detectors import Detectors, DetectState, detect_step
 
 RATE_HZ = 1000.0
 
@@ -98,7 +98,7 @@ def test_kernel_and_its_python_twin_agree() -> None:
     detectors = Detectors(DetectorConfig(settle_s=0.05), RATE_HZ)
     compiled = detectors.run(values)
     twin = Detectors(DetectorConfig(settle_s=0.05), RATE_HZ)
-    state, params = attributes(new_record(DETECT_STATE))[0], attributes(twin.params)[0]
+    state, params = attributes(new(DetectState))[0], attributes(twin.params)[0]
     plain = [detect_step.py_func(v, state, params) for v in values]  # pyright: ignore[reportFunctionMemberAccess]
     assert compiled.tolist() == plain
     assert state.statistic == pytest.approx(detectors.state[0]["statistic"], rel=1e-9)

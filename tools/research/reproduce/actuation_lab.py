@@ -178,7 +178,7 @@ def run(config: EmulationConfig, axis: int, volts: Array) -> Array:
     unit = stack_unit(config.stack, config.unit, axis)
     params, state = drive_channel(unit, config.amplifier, STEP_S, TEMPERATURE_C)
     stroke, terminal = np.empty(len(volts)), np.empty(len(volts))
-    drive_stack(params, state, volts, TEMPERATURE_C, STEPS_PER_MS, stroke, terminal)
+    drive_stack(params, state, volts, TEMPERATURE_C, STEPS_PER_MS, (stroke, terminal))
     return stroke * 1e6
 
 
@@ -200,7 +200,7 @@ def track(config: EmulationConfig, axis: int, controller: Controller, path_um: A
         slope, zero = controller.line
         volts = np.clip(zero + slope * ahead, 0.0, 100.0)
     else:
-        asked = command(controller.stack, ahead, NEUTRAL_V)
+        asked = command(controller.stack, ahead, neutral_V=NEUTRAL_V)
         volts, limited = asked.drive_V, asked.singular + asked.voltage + asked.slew
     z = run(config, axis, volts)
     noise = INTERFEROMETER_RMS_UM * np.random.default_rng(seed).standard_normal(len(z))

@@ -52,7 +52,15 @@ def tracking(fit: PiezoFit, plant: Plant, dt: float, preview_s: float) -> float:
     def path(at: Array) -> Array:
         return PATH_UM * np.clip(at / RISE_S, 0.0, 1.0) * np.sin(2.0 * np.pi * PATH_HZ * at)
 
-    asked = command(fit.stack, path(t + preview_s), fit.neutral_V, 1.0 / dt, 0.0, fit.high_V, 1e6)
+    asked = command(
+        fit.stack,
+        path(t + preview_s),
+        neutral_V=fit.neutral_V,
+        tick_hz=1.0 / dt,
+        low_V=0.0,
+        high_V=fit.high_V,
+        slew_V_per_s=1e6,
+    )
     z = plant.run(asked.drive_V)
     start, stop = (round(s / dt) for s in SCORED_S)
     return float(np.std(path(t)[start:stop] - z[start + DELAY : stop + DELAY]))

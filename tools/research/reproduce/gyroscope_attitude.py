@@ -7,13 +7,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.records import Record, new_record
-from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, restart
+from firmware_py.records import Record, new
+from firmware_py.sensing.attitude import restart
+from firmware_py.sensing.attitude_filter import Motion
 from firmware_py.sensing.attitude_params import gyroscope_error_state, gyroscope_quaternion_kalman
 from firmware_py.sensing.fusion import ALIGN_S, Fusion, FusionConfig, Method
-from firmware_py.sensing.gyroscope_filter import KALMAN_MEMORY, begin_gyroscope, run_gyroscope
+from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope
 from firmware_py.sensing.quaternion import from_matrix
-from firmware_py.sensing.quaternion_kalman import quaternion_kalman_step, start_quaternion_kalman
+from firmware_py.sensing.quaternion_kalman import begin_quaternion_kalman, quaternion_kalman_step
+from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanAttitude, QuaternionKalmanNumbers
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
 
@@ -44,7 +46,7 @@ def run_kernel(
     for i in range(3):
         s.field[i] = sums[1, i]
         s.rate[i] = rate[0, i]
-    start_quaternion_kalman(s, p.quaternion_kalman, 0.0)
+    begin_quaternion_kalman(s.field, s, p)
     for k in range(len(rate)):
         for i in range(3):
             motion[i] = force[k, i]
@@ -53,7 +55,7 @@ def run_kernel(
             s.previous[i] = change
         if np.isfinite(field[k, 0]):
             s.field[:] = field[k]
-        quaternion_kalman_step(s, p.quaternion_kalman, motion[:3], motion[3:], s.field, p.dt_s)
+        quaternion_kalman_step(Motion(motion[:3], motion[3:], True, p.dt_s), s, p)
         for i in range(4):
             out[k, i] = s.quaternion[i]
 
@@ -69,7 +71,7 @@ def gyroscope_attitude(
 ) -> NDArray[np.float64]:
     """(n, 4) quaternions, body to world (x magnetic north, z up), starting from TRIAD over the first 0.1 s.
 
-    ``setting``: other numbers for the error-state filter than ``gyroscope_error_state`` (dtype ``ERROR_STATE``).
+    ``setting``: other numbers for the error-state filter than ``gyroscope_error_state`` (``ErrorStateParams``).
     """
     if not len(rate) == len(force) == len(field) or len(rate) < 2:
         raise ValueError(f"rate, force and field have {len(rate)}, {len(force)} and {len(field)} rows")
@@ -79,12 +81,17 @@ def gyroscope_attitude(
     w, f, b = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, field))
     align = max(1, min(len(rate), round(ALIGN_S * rate_hz)))
     if method == "error-state":
-        memory = new_record(KALMAN_MEMORY)
+        memory = new(GyroscopeMemory)
         memory["params"]["error_state"] = gyroscope_error_state(gravity_m_s2) if setting is None else setting
         memory["params"]["align_samples"] = align
         begin_gyroscope(memory)
         run_gyroscope(memory, w, f, b, np.full(len(w), 1.0 / rate_hz), out)
         return out
-    params = new_record(ATTITUDE, dt_s=1.0 / rate_hz, quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2))
-    run_kernel(w, f, b, align, params, np.zeros(1, ATTITUDE_STATE), out)
+    params = new(
+        QuaternionKalmanNumbers,
+        dt_s=1.0 / rate_hz,
+        quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2),
+    )
+    state = new(QuaternionKalmanAttitude)
+    run_kernel(w, f, b, align, params, state, out)
     return out
