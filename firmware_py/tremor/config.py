@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import pairwise
 from math import inf
-from typing import Annotated, Any, Literal
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -108,10 +109,33 @@ class ArConfig(_Table):
     noise: Positive = 0.1  # of the signal's rms
 
 
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        # Below 6 Hz accelerometers know little; above the band, and at the stacks' resonance, the tip is to be still.
+        "still tip": MappingProxyType(
+            {
+                "cancel_from_hz": (3.0, 6.0),
+                "cancel_to_hz": (13.0, 16.0),
+                "emphasis": 1.0,
+                "relative": 12.0,
+                "core_q": 4.0,
+                "prior_s": 0.2,
+                "burst_prior_s": 0.5,
+                "share": 0.4,
+                "quiet": 130.0,
+                "shaken_hz": (600.0, 700.0),
+            }
+        )
+    }
+)
+"""Settings of the adaptive method by the name that a bench gives in ``preset``. Keys beside it override them."""
+
+
 class AdaptiveConfig(_Table):
     """Causal linear filter learned from the hand itself (firmware_py/tremor/adaptive.py).
 
-    ``memory_s`` is how long the hand is remembered, ``prior_s`` how many seconds of data the prior counts for.
+    ``preset`` names settings that are the start (``PRESETS``). ``memory_s`` is how long the hand is remembered,
+    ``prior_s`` how many seconds of data the prior counts for.
     ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out; ``core_hz``: the part of it that
     does not yield when the manipulator runs out of stroke. Two filters are learned, for a calm hand and for a burst,
     and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
@@ -127,6 +151,7 @@ class AdaptiveConfig(_Table):
     0: the error is counted in metres.
     """
 
+    preset: str = ""
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
     bandwidth_hz: Positive = 3.0
     slow_hz: tuple[Positive, ...] = (0.5, 2.0, 20.0)
@@ -173,6 +198,21 @@ class AdaptiveConfig(_Table):
     drift_m_s2: Positive = 0.03
     drift_s: Positive = 3.0
     reading_noise_m: Positive = 1e-6  # of a displacement sensor, per sample
+
+    @model_validator(mode="before")
+    @classmethod
+    def _start_from_preset(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        given = cast("dict[str, Any]", table)
+        return {**PRESETS.get(str(given.get("preset")), {}), **given}
+
+    @field_validator("preset")
+    @classmethod
+    def _known(cls, preset: str) -> str:
+        if preset and preset not in PRESETS:
+            raise ValueError(f"'{preset}' is no preset; there are {', '.join(PRESETS)}")
+        return preset
 
     @model_validator(mode="after")
     def _check(self) -> AdaptiveConfig:

@@ -129,11 +129,9 @@ def _inputs(given: Any) -> dict[str, int]:
 
 
 STILL_TIP = (
-    "[firmware.tremor.adaptive]", "cancel_from_hz = [3.0, 6.0]", "cancel_to_hz = [13.0, 16.0]", "emphasis = 1.0",
-    "relative = 12.0", "core_q = 4.0", "prior_s = 0.2", "burst_prior_s = 0.5", "share = 0.4", "quiet = 130.0",
-    "shaken_hz = [600.0, 700.0]", "", "[firmware.actuation]", "centring = 1.0",
+    "[firmware.tremor.adaptive]", 'preset = "still tip"', "", "[firmware.actuation]", "centring = 1.0",
 )  # fmt: skip
-"""The project's own benches have these where the output takes a command a tick (``AdaptiveConfig.cancel_from_hz``)."""
+"""The project's own benches have these where the output takes a command a tick (``AdaptiveConfig.preset``)."""
 
 
 def bench_text(draft: Draft, calibrations: list[str]) -> str:

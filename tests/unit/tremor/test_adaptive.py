@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.signal import cont2discrete, lfilter
 
 from firmware_py.tremor.adaptive_design import (
@@ -21,7 +22,7 @@ from firmware_py.tremor.adaptive_design import (
     spectra,
     target_taps,
 )
-from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
+from firmware_py.tremor.config import PRESETS, AdaptiveConfig, TremorConfig
 from firmware_py.tremor.estimator import Estimator
 from hal.errors import BenchError
 from tests.unit.tremor.compare import HELD_OUT, residuals
@@ -314,3 +315,11 @@ def test_what_is_learned_is_penalized_as_the_prior_is() -> None:
         ahead = Estimator(config, axes=1).run(record.acceleration[:, None]).ahead_m[:, 0]
         rough[quiet] = float(np.std(np.diff(ahead[-10_000:], 2)))
     assert rough[100.0] < 0.3 * rough[0.0]
+
+
+def test_a_preset_is_the_start_and_the_keys_beside_it_override_it() -> None:
+    config = AdaptiveConfig.model_validate({"preset": "still tip", "quiet": 5.0})
+    assert (config.quiet, config.relative) == (5.0, PRESETS["still tip"]["relative"])
+    assert AdaptiveConfig.model_validate(config.model_dump()) == config
+    with pytest.raises(ValidationError, match="'loud tip' is no preset; there are still tip"):
+        AdaptiveConfig.model_validate({"preset": "loud tip"})
