@@ -82,7 +82,7 @@ def design(
         done += 1
         if progress is not None:
             progress("inputs", done, evaluations)
-        return separation(where.course(waves(family, z)), rivals, sigma, QUICK, floor)
+        return separation(where.course(waves(family, z)), rivals, sigma, QUICK, floor, thorough=True)
 
     points: list[_Point] = []
     for name, (family, z) in LIBRARY.items():

@@ -13,13 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.situation import problem_of, simulated, with_outputs
 from tools.mismatch.recording import Array, Recording
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, starts
+
+MOST_PLACES = 3
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,8 @@ def refit(
 
     The search begins at the rival's own parameters and at those that the recording suggests for each effect, because a
     search from a single start may end in a local optimum and overestimate the distance of two models. ``thorough``:
-    each start is followed to convergence, and once more with settings of the effects that are read off this recording,
-    as a new diagnosis would do.
+    each start is followed to convergence, and the last effect may sit at another of its places, with settings that are
+    read off this recording, as a new diagnosis would do.
     """
     problem = problem_of(recording, sigma)
     model = Model(problem.twin, rival.placed)
@@ -68,27 +72,12 @@ def refit(
     found = [fitted(model, [rival.theta])]
     if suggested:
         found.append(fitted(model, suggested))
-    fresh = _with_new_settings(problem, model, rival.theta)
-    if fresh is not None:
-        found.append(fitted(*fresh))
+    if rival.placed:
+        rest = Model(problem.twin, rival.placed[:-1])
+        elsewhere = best_rival(problem, rest, model, rival.theta, rival.placed[-1].effect.name, iterations)
+        if elsewhere is not None:
+            found.append(fitted(Model(problem.twin, elsewhere.placed), [elsewhere.theta]))
     return min(found, key=lambda f: _or_infinite(squares(f, sigma)))
-
-
-def _with_new_settings(problem: Problem, model: Model, theta: Array) -> tuple[Model, list[Array]] | None:
-    """Return the model with the settings of its last effect read off the problem's recording, and its starts.
-
-    Returns None if the settings do not change.
-    """
-    if not model.placed:
-        return None
-    rest = Model(problem.twin, model.placed[:-1])
-    begin = rest.carry(model, theta, problem.recording)
-    placed = prepare(rest, problem.fit_view, begin, model.placed[-1])
-    if placed.settings == model.placed[-1].settings:
-        return None
-    other = Model(problem.twin, (*rest.placed, placed))
-    first = other.carry(rest, begin, problem.recording)
-    return other, starts(other, len(rest.placed), problem.fit_view, first)
 
 
 def _or_infinite(value: float) -> float:
@@ -136,7 +125,34 @@ def log_ratio(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, floa
     return 0.5 * (left[1] - left[0]) + price * (found[1].theta.size - found[0].theta.size)
 
 
-def fitted_rival(problem: Problem, name: str, placed: Sequence[Placed], starts: Sequence[Array]) -> Rival | None:
-    """Fit ``placed`` to the recording, from ``starts``; return None if no fit is finite."""
-    found = fit(problem, Model(problem.twin, placed), starts)
+def best_rival(
+    problem: Problem, rest: Model, full: Model, theta: Array, name: str, iterations: int = 25
+) -> Rival | None:
+    """Return the effect ``name`` beside those of ``rest`` at the place where it leaves least.
+
+    None where it cannot be placed or fitted.
+    """
+    recording = problem.recording
+    begin = rest.carry(full, theta, recording)
+    best: tuple[float, Rival] | None = None
+    for place in sites(problem.twin, recording, EFFECTS[name], rest.placed)[:MOST_PLACES]:
+        placed = prepare(rest, problem.fit_view, begin, place)
+        model = Model(problem.twin, (*rest.placed, placed))
+        first = model.carry(rest, begin, recording)
+        begins = starts(model, len(rest.placed), problem.fit_view, first)
+        rival = fitted_rival(problem, name, model.placed, begins, iterations)
+        if rival is None:
+            continue
+        left = model.residual(problem.view, rival.theta)
+        cost = float(sum(np.mean((left[o] / problem.sigma(o)) ** 2) for o in left))
+        if best is None or cost < best[0]:
+            best = (cost, rival)
+    return best[1] if best is not None else None
+
+
+def fitted_rival(
+    problem: Problem, name: str, placed: Sequence[Placed], begins: Sequence[Array], iterations: int = 25
+) -> Rival | None:
+    """Return ``placed`` fitted to the recording from ``begins``, None where no fit is finite."""
+    found = fit(problem, Model(problem.twin, placed), begins, iterations=iterations)
     return Rival(name, tuple(placed), found.theta) if found.ok and np.isfinite(found.cost) else None

@@ -6,22 +6,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from sim_devices.physics.catalogue import EFFECTS
 from tools.errors import InputError, RecordingError
 from tools.mismatch.apply import EVENTS, check_report, report_effects
-from tools.mismatch.engine.problem import Problem
-from tools.mismatch.plan.models import Rival, fitted_rival
+from tools.mismatch.plan.models import Rival, best_rival, fitted_rival
 from tools.mismatch.plan.situation import Situation, problem_of
-from tools.mismatch.recording import Array, TwinText
+from tools.mismatch.recording import TwinText
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_sites import sites
-from tools.mismatch.simulate_start import prepare, starts
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_text import restore
 from tools.mismatch.twins.make import make
-
-MOST_PLACES = 3
 
 
 def noise_of(report: Mapping[str, Any]) -> dict[str, float]:
@@ -85,25 +79,6 @@ def rivals_of(
         if rival is not None:
             out.append(rival)
     return out
-
-
-def best_rival(problem: Problem, rest: Model, full: Model, theta: Array, name: str) -> Rival | None:
-    """Place the effect ``name`` beside those of ``rest`` with the least residual; None if it cannot be fitted."""
-    recording = problem.recording
-    begin = rest.carry(full, theta, recording)
-    best: tuple[float, Rival] | None = None
-    for place in sites(problem.twin, recording, EFFECTS[name], rest.placed)[:MOST_PLACES]:
-        placed = prepare(rest, problem.fit_view, begin, place)
-        model = Model(problem.twin, (*rest.placed, placed))
-        first = model.carry(rest, begin, recording)
-        rival = fitted_rival(problem, name, model.placed, starts(model, len(rest.placed), problem.fit_view, first))
-        if rival is None:
-            continue
-        left = model.residual(problem.view, rival.theta)
-        cost = float(sum(np.mean((left[o] / problem.sigma(o)) ** 2) for o in left))
-        if best is None or cost < best[0]:
-            best = (cost, rival)
-    return best[1] if best is not None else None
 
 
 def _same_twin(where: Situation, report: Mapping[str, Any]) -> None:

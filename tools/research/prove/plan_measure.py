@@ -31,9 +31,8 @@ import numpy as np
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.plan.design import FULL, design, random_inputs
 from tools.mismatch.plan.limits import Wish, settle_limits
-from tools.mismatch.plan.models import Rival, distance, log_ratio, refit, squares
+from tools.mismatch.plan.models import Rival, best_rival, distance, log_ratio, refit, squares
 from tools.mismatch.plan.responses import ground
-from tools.mismatch.plan.rivals import best_rival
 from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, with_outputs
 from tools.mismatch.plan.waveforms import LIBRARY, SIZE, draw
 from tools.mismatch.recording import Array, Recording
