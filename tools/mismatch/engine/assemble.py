@@ -1,4 +1,4 @@
-"""The report put together from what the engine found."""
+"""Assembles the report from the results of the search."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 
 
 def base_shifts(raw: Fit, base: Fit, fitted: Fit, deviations: Array) -> list[BaseShift]:
-    """Return how far the missing effects had pulled the base parameters."""
+    """Return the shift of the base parameters by the missing effects."""
     shifts: list[BaseShift] = []
     for i in range(base.model.n_base):
         p = base.model.parameters[i]
@@ -73,8 +73,10 @@ def assemble(
     posed: Posed, ended: Ended, screened: Sequence[Trial], left: dict[str, Leftover], *, decision: Decision,
     sure: Mapping[str, float], least: LeastNamed, withheld: Sequence[Withheld] = (), jobs: int = 1,
 ) -> Report:  # fmt: skip
-    """Everything the contract asks for. ``screened``: the candidates beside the base; ``sure``: per name;
-    ``withheld``: effects that are not named.
+    """Assemble the report of the contract.
+
+    ``screened``: the candidates beside the base; ``sure``: the probability per name; ``withheld``: effects that are not
+    named.
     """
     problem, raw, base, fitted = posed.problem, posed.raw, ended.base, ended.fitted
     rec, twin, official = problem.recording, problem.twin, ended.official
@@ -88,7 +90,7 @@ def assemble(
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
     off = imitable(physics, twin)
     if inside_of(twin) is not None and much_left(physics, {o: hi for o, (_, hi) in decision.floors.items()}):
-        # a page that says "not the whole account" cannot be sure of the account
+        # an incomplete account limits the probability of its names
         physics = tempered(physics)
     physics = [tempered([f])[0] if it else f for f, it in zip(physics, off, strict=True)]
     if (off and all(off)) or out_of_reach(physics, twin, {o: hi for o, (_, hi) in decision.floors.items()}):
@@ -220,19 +222,19 @@ def conclude(
     posed: Posed, ended: Ended, screened: Sequence[Trial], left: dict[str, Leftover], *, decision: Decision,
     sure: Mapping[str, float], least: LeastNamed, withheld: Sequence[Withheld] = (), jobs: int = 1,
 ) -> Report:  # fmt: skip
-    """The report of a finished search. ``screened``: the candidates beside the base; ``sure``: per name."""
+    """Return the report of a finished search; ``screened``: the candidates beside the base; ``sure``: per name."""
     report = assemble(
         posed, ended, screened, left, decision=decision, sure=sure, least=least, withheld=withheld, jobs=jobs
     )
     if posed.recording.parts:
-        # what is not named is not part of the model that recordings are compared under
+        # recordings are compared under the model of the named effects only
         named = ended.fitted if report.physics else ended.base
         report = replace(report, together=compare_recordings(posed.problem, ended.base, named, jobs))
     return report
 
 
 def gross(posed: Posed) -> list[str]:
-    """Messages of the cheap checks, on the simulation as given."""
+    """Return the messages of the cheap checks, on the simulation as given."""
     recording, twin, raw = posed.recording, posed.problem.twin, posed.raw
     whole = View.whole(recording)
     with np.errstate(all="ignore"):
@@ -242,9 +244,11 @@ def gross(posed: Posed) -> list[str]:
 
 
 def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[DependsOn]) -> list[DependsOn]:
-    """What the first named effect follows by its nature comes first: the context signal that it needs, time for what
-    comes from outside, recorded signals for what these drive (slow motion goes with some course in time as well). Its
-    strength is the share of the residual that the effects took.
+    """Order the followed signals so that the one which the first named effect follows by its nature comes first.
+
+    This is the context signal that it needs, time for an addition from outside, or recorded signals for an effect that
+    they drive (slow motion also correlates with time). Its strength is the share of the residual that the effects
+    explain.
     """
     first = fitted.model.placed[0]
     effect = first.effect
@@ -263,14 +267,14 @@ def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[D
 
 
 def anew(problem: Problem | None, fitted: Fit) -> Fit:
-    """The same parameters simulated for another problem."""
+    """Return the same parameters simulated for another problem."""
     if problem is None:
         return fitted
     return replace(fitted, residual=residuals(problem, fitted.model, fitted.theta))
 
 
 def guess_stage(chain: Sequence[str], depends: Sequence[DependsOn]) -> str:
-    """A stage for what has no name: the environment for what follows context or time, else the middle."""
+    """Return the stage of an unnamed rest: the environment if it follows context or time, else the middle."""
     if depends and depends[0].signal == "time" and "environment" in chain:
         return "environment"
     for s in ("actuator", "mechanics", "sensor"):
@@ -288,7 +292,7 @@ def summary(
     base: Fit,
     fitted: Fit,
 ) -> str:
-    """One sentence a bench engineer would say, and one about what is left where that is much."""
+    """Summarise the answer in a sentence for a bench engineer, and a large rest in a second one."""
     verdict, outputs = decision.verdict, ", ".join(guilty)
     a, b = held_rms(problem, base), held_rms(problem, fitted)
     if verdict == "agrees":
@@ -301,14 +305,14 @@ def summary(
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
         factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o], problem.recording.file_unit[o])
-        said = (
+        text = (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
             f" from {number(factor * a[o])} to {number(factor * b[o])} {unit}."
         )
         times = b[o] / max(decision.floors[o][1], 1e-300)
         if times > MUCH_LEFT and b[o] > problem.recording.tolerance.get(o, 0.0):
-            said += f" That is still {number(times)} times the noise: it is not the whole account."
-        return said
+            text += f" That is still {number(times)} times the noise: it is not the whole account."
+        return text
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
     if decision.meaning == "floor_doubtful":
         return f"Something may be left in {outputs}{what}; whether it is noise this recording does not say."
@@ -318,4 +322,4 @@ def summary(
 
 
 MUCH_LEFT = 2.0
-"""Times the upper end of the noise floor above which the summary says what is left."""
+"""Ratio of the rest to the upper end of the noise floor above which the summary mentions the rest."""

@@ -1,4 +1,4 @@
-"""Cheap checks before any blame: is this the right signal, the right way round, in the right unit, complete."""
+"""Checks a recording before a diagnosis: right signal, sign, unit, and completeness."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ FACTORS = {
 
 
 def constant_channels(signals: Mapping[str, Array]) -> list[str]:
-    """Names of channels that never move."""
+    """Return the names of channels that never move."""
     return [s for s, x in signals.items() if float(np.ptp(x)) == 0.0]
 
 
 def clipped_samples(y: Array) -> tuple[int, int]:
-    """Return how many samples sit in runs of three or more at the exact lowest and highest value."""
+    """Return the number of samples in runs of three or more at the exact lowest and highest value."""
 
     def runs(level: float) -> int:
         at = np.concatenate(([0], (y == level).astype(int), [0]))
@@ -43,7 +43,7 @@ def clipped_samples(y: Array) -> tuple[int, int]:
 
 
 def repeated_samples(y: Array) -> int:
-    """Samples that equal the one before although the channel has fine steps: a logger that held its value."""
+    """Count the samples that equal the previous one although the channel has fine steps: a logger held its value."""
     same = int(np.sum(np.diff(y) == 0))
     if lattice_step(y) > 0 or np.unique(y).size < 0.5 * y.size:
         return 0
@@ -51,7 +51,7 @@ def repeated_samples(y: Array) -> int:
 
 
 def lag_samples(y: Array, x: Array, most: int) -> int:
-    """Shift of ``y`` against ``x`` (n,) in samples that correlates best, within ``most``; positive: ``y`` is late."""
+    """Return the shift of ``y`` against ``x`` (n,) in samples with the best correlation; positive: ``y`` is late."""
     a, b = y - y.mean(), x - x.mean()
     if not np.any(a) or not np.any(b):
         return 0
@@ -63,7 +63,7 @@ def lag_samples(y: Array, x: Array, most: int) -> int:
 
 
 def gross_scale(y: Array, simulated: Array) -> tuple[float, float]:
-    """(slope, correlation) of a recorded output against the simulation as given."""
+    """Return (slope, correlation) of a recorded output against the simulation as given."""
     a, b = y - y.mean(), simulated - simulated.mean()
     power, both = float(b @ b), float(a @ b)
     size = float(np.sqrt((a @ a) * power))
@@ -78,7 +78,7 @@ def messages(
     drives: Mapping[str, str],
     dt: float,
 ) -> list[str]:
-    """Return what a bench engineer should look at before blaming physics. ``simulated``: the twin as given (n,)."""
+    """Return messages on faults of the recording that are not physics. ``simulated``: the twin as given (n,)."""
     out: list[str] = []
     for s in constant_channels({**inputs, **outputs, **context}):
         out.append(f"{s} never changes: is it connected?")

@@ -1,6 +1,6 @@
-"""The colour of a residual: a long autoregression that whitens it, and what correlation costs in samples.
+"""Models the colour of a residual by a long autoregression that whitens it.
 
-Ordinary lags see the fast part, block means over the last 4, 16, ... samples the slow part (the heterogeneous
+Ordinary lags model the fast part, block means over the last 4, 16, ... samples the slow part (the heterogeneous
 autoregression of Corsi, J. Financial Econometrics 7(2), 2009, equation 8): a dozen coefficients follow white noise plus
 a slow wander, where a plain autoregression would need hundreds.
 """
@@ -17,13 +17,15 @@ from hal.compiled import kernel
 Array = NDArray[np.float64]
 
 
-AT_ONCE = 2048  # samples that stay in the processor's first cache while every coefficient passes over them
+AT_ONCE = 2048  # number of samples that stay in the processor's first cache while all coefficients are applied
 
 
 @kernel
 def whiten_stretch(x, lags, scales, weights, warm):
-    """Innovations (k, n - warm) of one stretch x (k, n), a signal per row: each sample less ``lags[i]`` times the one
-    i + 1 before it and ``weights[j]`` times the mean of the ``scales[j]`` before it.
+    """Return the innovations (k, n - warm) of a stretch x (k, n), a signal per row.
+
+    From each sample ``lags[i]`` times the sample i + 1 before it and ``weights[j]`` times the mean of the ``scales[j]``
+    samples before it are subtracted.
     """
     k, n = x.shape
     out = np.empty((k, n - warm))
@@ -35,7 +37,7 @@ def whiten_stretch(x, lags, scales, weights, warm):
             last = min(first + AT_ONCE, n)
             here = out[c, first - warm : last - warm]
             here[:] = x[c, first:last]
-            # one coefficient over many samples, not all over one: these loops run in vector registers
+            # each coefficient is applied to many samples at once, so that the loops run in vector registers
             for a in range(lags.size):
                 gain = lags[a]
                 before = x[c, first - 1 - a : last - 1 - a]
@@ -52,8 +54,8 @@ def whiten_stretch(x, lags, scales, weights, warm):
 
 @dataclass(frozen=True)
 class Whitener:
-    """What leaves innovations of a residual: coefficients on the last samples (``lags``) and on the means of the last
-    ``scales[j]`` samples (``weights``).
+    """Whitens a residual by coefficients on the last samples (``lags``) and on the means of the last ``scales[j]``
+    samples (``weights``).
     """
 
     innovation_rms: float
@@ -63,11 +65,11 @@ class Whitener:
 
     @property
     def warm_up(self) -> int:
-        """Samples at the start of a stretch that cannot be whitened."""
+        """Return the number of samples at the start of a stretch that cannot be whitened."""
         return int(max(self.lags.size, self.scales.max(initial=0)))
 
     def spectrum(self, cycles: Array) -> Array:
-        """Power (k,) of the residual at ``cycles`` (k,) per sample; its mean over -1/2..1/2 is the mean square."""
+        """Return the power (k,) of the residual at ``cycles`` (k,) per sample; its mean over -1/2..1/2 is its power."""
         back = -2j * np.pi * np.asarray(cycles)
         answer = np.ones(back.size, complex)
         for i, a in enumerate(self.lags):
@@ -80,7 +82,7 @@ class Whitener:
         return self.innovation_rms**2 / np.maximum(np.abs(answer) ** 2, 1e-4)
 
     def apply(self, x: Array) -> Array:
-        """Whitened copy of one stretch ``x`` (n,) or (n, k) without its first ``warm_up`` samples."""
+        """Return a whitened copy of a stretch ``x`` (n,) or (n, k) without its first ``warm_up`` samples."""
         warm = self.warm_up
         if x.shape[0] <= warm:
             return x[:0]
@@ -102,9 +104,9 @@ def _scales(n: int, lags: int) -> list[int]:
 
 
 def fit_whitener(e: Array, *, lags: int = 6, stretches: list[tuple[int, int]] | None = None) -> Whitener:
-    """Whitening filter of the residual ``e`` (n,), estimated by least squares over ``stretches``.
+    """Estimate the whitening filter of the residual ``e`` (n,) by least squares over ``stretches``.
 
-    Outliers are clipped at six robust standard deviations for the estimate, so that a spike does not own it.
+    Outliers are clipped at six robust standard deviations for the estimate, so that a spike does not dominate it.
     """
     stretches = stretches or [(0, e.size)]
     longest = max(b - a for a, b in stretches)
@@ -143,12 +145,12 @@ def fit_whitener(e: Array, *, lags: int = 6, stretches: list[tuple[int, int]] | 
 
 
 def whiten(model: Whitener, x: Array, stretches: list[tuple[int, int]]) -> Array:
-    """``x`` (n,) or (n, k) whitened stretch by stretch and joined."""
+    """Return ``x`` (n,) or (n, k), whitened stretch by stretch and joined."""
     return np.concatenate([model.apply(x[a:b]) for a, b in stretches])
 
 
 def autocovariance(e: Array, lags: int) -> Array:
-    """Biased autocovariance at 0..``lags`` (FFT)."""
+    """Return the biased autocovariance at 0..``lags`` (by FFT)."""
     x = e - e.mean()
     n = x.size
     size = 1 << int(np.ceil(np.log2(2 * n)))
@@ -157,7 +159,7 @@ def autocovariance(e: Array, lags: int) -> Array:
 
 
 def ljung_box(e: Array, lags: int = 25) -> float:
-    """p-value of whiteness (Ljung and Box, Biometrika 65, 1978)."""
+    """Return the p-value of whiteness (Ljung and Box, Biometrika 65, 1978)."""
     from scipy.stats import chi2
 
     n = e.size

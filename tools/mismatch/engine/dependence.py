@@ -1,8 +1,8 @@
-"""Does a residual follow a signal? Curves regressed with coloured errors, each test honest about autocorrelation.
+"""Tests if a residual follows a signal: curves are regressed with coloured errors.
 
 Residual and curve pass the same whitening filter (generalised least squares; Cochrane and Orcutt, JASA 44, 1949):
 the F statistic counts independent innovations and not the samples of a slow wander. The filter is estimated on the
-residual as it is, which books part of a true dependence as colour: conservative, never the other way.
+residual itself, which attributes part of a true dependence to colour: the test is conservative.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Dependence:
-    """``p_value`` that the residual does not follow the feature; ``strength`` the cross-fitted share of its
-    variance, 0..1, that a curve of the feature predicts on blocks that the curve has not seen.
+    """Holds the ``p_value`` of the null hypothesis that a residual does not follow a feature, and the ``strength``.
+
+    ``strength`` is the cross-fitted share of the variance, 0..1, that a curve of the feature predicts on held-out
+    blocks.
     """
 
     signal: str
@@ -35,7 +37,7 @@ class Dependence:
 
 
 def whitened_f(e_white: Array, columns_white: Array) -> float:
-    """p-value of the F test that ``columns_white`` (m, k) and a constant explain nothing of ``e_white`` (m,)."""
+    """Return the p-value of the F test that ``columns_white`` (m, k) and a constant do not explain ``e_white`` (m,)."""
     m, k = columns_white.shape
     if m < 4 * (k + 1):
         return 1.0
@@ -45,13 +47,15 @@ def whitened_f(e_white: Array, columns_white: Array) -> float:
     rest = float(e @ e) - gain
     if rank == 0 or rest <= 0:
         return 1.0 if rank == 0 else 0.0
-    # heavy tails cost some of the F statistic's exactness; excess kurtosis enters by k/m only
+    # the F statistic is approximate for heavy tails; excess kurtosis enters by k/m only
     return float(f_distribution.sf(gain / rank / (rest / (m - rank - 1)), rank, m - rank - 1))
 
 
 def _axes(x: Array) -> Array:
-    """(k, rank): ``x`` (m, k) times this is an orthonormal basis of its columns, by the eigenvectors of the Gram matrix
-    of the scaled columns (a tenth of the time of a QR factorisation of so tall a matrix).
+    """Return a matrix (k, rank) that maps ``x`` (m, k) to an orthonormal basis of its columns.
+
+    It uses the eigenvectors of the Gram matrix of the scaled columns, which take a tenth of the time of a QR
+    factorisation of so tall a matrix.
     """
     size = np.sqrt(np.einsum("ij,ij->j", x, x))
     usable = size > 1e-9 * float(size.max(initial=0.0))
@@ -63,20 +67,20 @@ def _axes(x: Array) -> Array:
 
 
 def projected_energy(e: Array, x: Array) -> tuple[float, int]:
-    """(sum of squares of the projection of ``e`` (m,) on the columns of ``x`` (m, k), their rank)."""
+    """Return (sum of squares of the projection of ``e`` (m,) on the columns of ``x`` (m, k), their rank)."""
     axes = _axes(x)
     return float(np.sum((axes.T @ (x.T @ e)) ** 2)), axes.shape[1]
 
 
 def cross_fitted_share(e: Array, columns: Array, blocks: list[Span]) -> float:
-    """Share of the variance of ``e`` (n,) that a curve fitted on the other half of the blocks predicts.
+    """Return the share of the variance of ``e`` (n,) that a curve fitted on the other half of the blocks predicts.
 
-    Sums of products per half of the blocks say all of it: the columns are passed over once and not copied.
+    Sums of products per half of the blocks suffice: the columns are read once and not copied.
     """
     k = columns.shape[1] + 1
     gram, cross = np.zeros((2, k, k)), np.zeros((2, k))
     count, square = np.zeros(2), np.zeros(2)
-    e = e - e.mean()  # else a level far from zero takes the digits of what is left
+    e = e - e.mean()  # avoids cancellation for a level far from zero
     for number, (a, b) in enumerate(blocks):
         half, x, y = number % 2, columns[a:b], e[a:b]
         gram[half, 1:, 1:] += x.T @ x
@@ -110,10 +114,10 @@ def dependences(
     whitener: Whitener | None = None,
     own_colour: bool = False,
 ) -> list[Dependence]:
-    """Every feature tested against the residual ``e`` (n,); p-values Holm-corrected; strongest first.
+    """Test every feature against the residual ``e`` (n,); p-values are Holm-corrected; strongest first.
 
-    ``own_colour``: the filter of each test from what its curve leaves (Cochrane and Orcutt), which has more power
-    against a slow signal; two wanders that have nothing to do with each other leave a wander and stay unrelated.
+    With ``own_colour`` the filter of each test is estimated on the residual of its curve (Cochrane and Orcutt), which
+    has more power against a slow signal; two independent wanders leave a wander and stay unrelated.
     """
     stretches = stretches or [(0, e.size)]
     if blocks is None:
@@ -145,7 +149,7 @@ def dependences(
 
 
 def _after_its_curve(e: Array, columns: Array, stretches: list[Span]) -> float:
-    """p-value of a curve, whitened by the colour of what it leaves."""
+    """Return the p-value of a curve, whitened by the colour of its residual."""
     design = np.column_stack([np.ones(e.size), columns])
     size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     left = e - design @ (np.linalg.lstsq(design / size, e, rcond=1e-8)[0] / size)
@@ -158,7 +162,7 @@ def _after_its_curve(e: Array, columns: Array, stretches: list[Span]) -> float:
 def needs_memory(
     e: Array, present: list[Feature], past: list[Feature], *, stretches: list[Span] | None = None
 ) -> float:
-    """p-value that the past adds nothing to the present: small means a missing state, not a missing function.
+    """Return the p-value that the past adds nothing to the present; a small one means a missing state.
 
     ``present``: features of values and rates now; ``past``: features with memory (Hooker and Ellner, Annals of
     Applied Statistics 9, 2015: a forcing that its state does not explain but its history does).

@@ -1,4 +1,4 @@
-"""How well what was read off the data is known: instants of steps, the step of a grid. No fit moves these."""
+"""Estimates the uncertainty of values that were read off the data and not fitted: instants of steps, grid steps."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from sim_devices.physics.statistics import long_run_rms
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 
-YAO = 11.0  # noise variances over the squared height: 95 % half width of an instant, in samples
-PRINTED = 1e-8  # of a grid's step: what figures in a text file leave open
+YAO = 11.0  # 95 % half width of an instant, in samples, per noise variance over the squared height
+PRINTED = 1e-8  # rounding of figures in a text file, relative to a grid's step
 
 
 def half_widths(problem: Problem, fitted: Fit, k: int) -> dict[str, float]:
-    """95 % half widths of the human parameters that effect ``k`` took from the data, by their names.
+    """Return 95 % half widths of the human parameters that effect ``k`` read off the data, by their names.
 
-    An instant by Y.-C. Yao, Annals of Statistics 15 (1987) 1321 (argmax of a Brownian motion with drift), with the
-    long-run noise, two samples and half the rise on top; the step of a grid by how far readings
-    lie off it over its range.
+    That of an instant follows Y.-C. Yao, Annals of Statistics 15 (1987) 1321 (argmax of a Brownian motion with drift),
+    with the long-run noise, plus two samples and half the rise; that of a grid's step follows from the deviations of
+    readings over its range.
     """
     placed = fitted.model.placed[k]
     settings, o = placed.settings, placed.outputs[0]

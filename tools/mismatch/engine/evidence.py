@@ -1,8 +1,8 @@
-"""The evidence for an effect: a report may name those whose size the data show to differ from zero.
+"""Judges the evidence for an effect: a report names only effects whose size differs significantly from zero.
 
-A search accepts an effect because the held-out residual falls. That alone does not say that the effect is what its name
-says: a gap of 0.00007 between -0.0003 and 0.0004 lowers a residual, too. What fails here the report lists as tried and
-not named, with the reason.
+A search accepts an effect because the held-out residual falls. That alone does not prove the effect: a gap of 0.00007
+with the interval -0.0003 to 0.0004 lowers a residual, too. The report lists effects that fail here as tried and not
+named, with the reason.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tools.mismatch.engine.report import ParameterValue, WithheldReason
 
 @dataclass(frozen=True)
 class Doubt:
-    """Why effect ``k`` of a model is not named: ``reason``, and the parameters that show it."""
+    """Holds the ``reason`` why effect ``k`` of a model is not named, and the parameters that show it."""
 
     k: int
     reason: WithheldReason
@@ -30,10 +30,10 @@ class Doubt:
 
 
 def holds_zero(p: ParameterValue, among: int = 1) -> bool:
-    """Return whether the interval contains zero that holds at 95 % for ``among`` parameters together (Z. Sidak, J. Am.
-    Stat. Assoc. 62 (1967) 626); an interval that is not finite does.
+    """Return True if the simultaneous 95 % interval for ``among`` parameters contains zero or is not finite.
 
-    The more sizes an effect has, the likelier is one of them away from zero by chance.
+    Z. Sidak, J. Am. Stat. Assoc. 62 (1967) 626: with more sizes of an effect, one of them differs from zero by chance
+    more often.
     """
     lo, hi = p.ci95
     if not (np.isfinite(lo) and np.isfinite(hi)):
@@ -43,7 +43,7 @@ def holds_zero(p: ParameterValue, among: int = 1) -> bool:
 
 
 def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> list[tuple[str, ...]]:
-    """The groups of ``effect.vanishes_with`` all of whose parameters may be zero, as the parameters' names."""
+    """Return the groups of ``effect.vanishes_with`` of which all parameters may be zero, as the parameters' names."""
     out: list[tuple[str, ...]] = []
     for patterns in effect.vanishes_with or (("*",),):
         names = tuple(n for n in parameters if any(fnmatchcase(n, q) for q in patterns))
@@ -53,10 +53,10 @@ def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> l
 
 
 def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsure: Uncertainty) -> Doubt | None:
-    """Why effect ``k`` of a model may not be named; None when it may.
+    """Return why effect ``k`` of a model may not be named; None if it may.
 
-    An effect that is nothing but weights is there where these are not all zero together: one that trades with a base
-    parameter is sure as a whole and unsure in every figure.
+    An effect that has only weights is significant if they are not jointly zero: one that is correlated with a base
+    parameter is certain as a whole and uncertain in every figure.
     """
     placed, at_bound = fitted.model.placed[k], fitted.at_bound
     stuck = tuple(n for n in placed.effect.essential if f"{placed.label}.{n}" in at_bound)

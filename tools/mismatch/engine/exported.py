@@ -1,4 +1,4 @@
-"""The model that a corrected twin is written from: without what happened in one recording, solved again without it."""
+"""Prepares the model that a corrected twin is written from: events of the recording are removed and it is re-solved."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from tools.mismatch.simulate import Model
 
 
 def without_events(problem: Problem, fitted: Fit) -> Fit:
-    """``fitted`` without its events. Its linear parameters are solved again: an offset that was fitted beside a level
-    that jumps is not the offset of a run without the jump.
+    """Return ``fitted`` without its events, with linear parameters solved again.
+
+    An offset that was fitted beside a jump of the level is not the offset of a run without the jump.
     """
     kept = [p for p in fitted.model.placed if p.effect.name not in EVENTS]
     if len(kept) == len(fitted.model.placed):
@@ -27,7 +28,7 @@ def without_events(problem: Problem, fitted: Fit) -> Fit:
 
 
 def raw_values(fitted: Fit) -> Mapping[str, Mapping[str, float]]:
-    """Parameters of each effect by its label, under the names that a twin file gives them."""
+    """Return the parameters of each effect by its label, under the names of a twin file."""
     out: dict[str, Mapping[str, float]] = {}
     for k, placed in enumerate(fitted.model.placed):
         a, b = fitted.model.slices(k)

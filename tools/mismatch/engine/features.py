@@ -1,4 +1,4 @@
-"""What a residual may follow: features of every recorded signal."""
+"""Computes features of every recorded signal that a residual may follow."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Feature:
-    """``columns`` (n, k): a flexible curve of the feature is a linear combination of them.
+    """Holds ``columns`` (n, k), of which a flexible curve of the feature is a linear combination.
 
     ``memory`` says that the feature needs more than the present value and rate of recorded signals.
     """
@@ -28,12 +28,12 @@ class Feature:
 
 
 def side_by_side(signals: Sequence[Array]) -> Array:
-    """(n, k) from k signals (n,), each of them contiguous: filters and sums of products pass along a signal."""
+    """Stack k signals (n,) to (n, k), each contiguous: filters and sums of products pass along a signal."""
     return np.stack(signals).T
 
 
 def curve(x: Array, knots: int = 7) -> Array:
-    """Columns (n, k) that span piecewise linear curves of ``x`` (n,): the value and hinges at its quantiles."""
+    """Return columns (n, k) that span piecewise linear curves of ``x`` (n,): the value and hinges at its quantiles."""
     spread = float(np.std(x))
     if spread <= 1e-12 * max(float(np.max(np.abs(x))), 1e-300):
         return np.empty((x.size, 0))
@@ -47,7 +47,7 @@ def curve(x: Array, knots: int = 7) -> Array:
 
 
 def rate_of(x: Array, dt: float, width: int = 1) -> Array:
-    """Rate (n,) of ``x`` by differences over ``width`` samples either way."""
+    """Return the rate (n,) of ``x`` by differences over ``width`` samples either way."""
     if width <= 1:
         return np.gradient(x, dt)
     padded = np.concatenate([np.full(width, x[0]), x, np.full(width, x[-1])])
@@ -55,14 +55,14 @@ def rate_of(x: Array, dt: float, width: int = 1) -> Array:
 
 
 def recent_mean(x: Array, seconds: float, dt: float) -> Array:
-    """Exponentially fading mean (n,) of the past of ``x``, starting in equilibrium."""
+    """Return the exponentially weighted mean (n,) of the past of ``x``, starting in equilibrium."""
     a = float(np.exp(-dt / seconds))
     return lfilter([1 - a], [1, -a], x, zi=np.array([a * x[0]]))[0]
 
 
 @kernel
 def last_reversal(x, band):
-    """Value (n,) of ``x`` at its last reversal of more than ``band``: what a loop remembers."""
+    """Return the value (n,) of ``x`` at its last reversal of more than ``band``, which is the memory of a loop."""
     out = np.empty_like(x)
     extreme = held = x[0]
     direction = 0
@@ -80,24 +80,24 @@ def last_reversal(x, band):
 
 
 def envelope(x: Array, seconds: float, dt: float) -> Array:
-    """Slow amplitude (n,) of ``x``: fading rms about its fading mean."""
+    """Return the slow amplitude (n,) of ``x``: weighted rms about its weighted mean."""
     fluctuation = x - recent_mean(x, 3 * seconds, dt)
     return np.sqrt(np.maximum(recent_mean(fluctuation**2, seconds, dt), 0.0))
 
 
 def local_frequency(x: Array, seconds: float, dt: float) -> Array:
-    """Local centre frequency (n,), Hz: fading rms of the rate over that of the value."""
+    """Return the local centre frequency (n,), Hz: weighted rms of the rate over that of the value."""
     rate = rate_of(x, dt)
     return envelope(rate, seconds, dt) / (2 * np.pi * np.maximum(envelope(x, seconds, dt), 1e-12 * np.std(x) + 1e-300))
 
 
 def standard(x: Array) -> Array:
-    """``x`` (n,) less its mean, over its deviation."""
+    """Return ``x`` (n,) less its mean, over its deviation."""
     return (x - x.mean()) / (np.std(x) or 1.0)
 
 
 def alike(a: Array, b: Array) -> bool:
-    """Return whether two standardised signals (n,) are one but for a trifle (correlation beyond 0.99)."""
+    """Return True if two standardised signals (n,) are nearly equal (correlation beyond 0.99)."""
     return abs(float(np.mean(a * b))) > 0.99
 
 
@@ -108,11 +108,12 @@ def _moves(x: Array) -> bool:
 def features_of(
     signals: Mapping[str, Array], dt: float, *, pairs: bool = True, drive: str = "", motion: str = ""
 ) -> list[Feature]:
-    """Every feature tested: per signal its value, rate, acceleration, sign of rate, square, last reversal, recent
-    history, amplitude and frequency; products of two signals; time itself. ``signals`` (n,) each.
+    """Return every feature to be tested; ``signals`` (n,) each.
 
-    A gain that depends on a signal is a curve of that signal times ``drive`` or ``motion`` (the plant's own course):
-    its ``kind`` is "cross product" and its signal the one that sets the gain.
+    Per signal these are value, rate, acceleration, sign of rate, square, last reversal, recent history, amplitude and
+    frequency; further products of two signals, and time itself. A gain that depends on a signal is a curve of that
+    signal times ``drive`` or ``motion`` (the plant's own course): its ``kind`` is "cross product" and its signal the
+    one that sets the gain.
     """
     out: list[Feature] = []
     names = [k for k, v in signals.items() if _moves(v)]

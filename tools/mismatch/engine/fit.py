@@ -1,4 +1,4 @@
-"""Output-error fits inside the simulator: what is linear solved exactly, what is not searched within bounds.
+"""Fits output errors inside the simulator: linear parameters are solved exactly, others are searched within bounds.
 
 A damped Gauss-Newton search over the nonlinear parameters of projected, noise-weighted residuals. Base parameters are
 always free. On a long recording the search begins on its first part, when that shows all that the inputs do.
@@ -23,23 +23,25 @@ from tools.mismatch.twins.ode import inside_of
 
 Array = NDArray[np.float64]
 
-LEAST_ROWS = 2000  # that a coarse search looks at
-MOST_ROWS = 300_000  # that any search looks at
+LEAST_ROWS = 2000  # number of rows of a coarse search
+MOST_ROWS = 300_000  # largest number of rows of any search
 SEARCH_ROWS = 12_000
-"""Rows on which a long search finds its way."""
+"""Number of rows of the first part of a long search."""
 NEAR = 1.05
-"""Cost of the second best start of a coarse search over the best: beyond it the second is not refined."""
+"""Cost ratio of the second best start of a coarse search to the best, above which the second is not refined."""
 NEAR_INSIDE = 2.0
-"""The same for forces inside differential equations, where a few steps from far away say little (set on a motor with
-friction: the start that led to the optimum came second by 1.13)."""
+"""Value of ``NEAR`` for forces inside differential equations, where the first steps from a distant start say little. It
+was set on a motor with friction, where the start that led to the optimum came second by 1.13."""
 LAST_ITERATIONS = 4
-"""Steps on all rows after that."""
+"""Number of steps on all rows at the end of a long search."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model. ``theta`` all parameters; ``residual[output]`` (m,) on the problem's view, measured minus
-    simulated; ``cost`` the weighted sum of squares on fit rows; ``at_bound`` names of parameters stuck there.
+    """Holds a fitted model.
+
+    ``theta`` has all parameters; ``residual[output]`` (m,) on the problem's view is measured minus simulated; ``cost``
+    is the weighted sum of squares on fit rows; ``at_bound`` names the parameters that ended at a bound.
     """
 
     model: Model
@@ -76,7 +78,7 @@ def _step_size(p: Free, v: float) -> float:
 
 
 def moved_a_little(model: Model, theta: Array, i: int) -> Array:
-    """``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
+    """Return ``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
     p = model.parameters[i]
     z, h = to_search(p, theta[i]), _step_size(p, theta[i])
     shifted = theta.copy()
@@ -87,8 +89,9 @@ def moved_a_little(model: Model, theta: Array, i: int) -> Array:
 
 
 def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
-    """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences. What moves
-    some outputs alone is simulated on these.
+    """Return the sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences.
+
+    A parameter that moves only some outputs is simulated on these.
     """
     model = projected.model
     out = np.zeros((residual.size, len(projected.free)))
@@ -109,11 +112,11 @@ def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
 
 
 UNSEEN = 1e-9
-"""Change of a residual by a parameter as a whole, relative to the residual, below which the parameter stays put."""
+"""Relative change of a residual by a parameter of its full size below which the parameter is not moved."""
 
 
 def without_unseen(gradient: Array, hessian: Array, typical: Array, cost: float) -> tuple[Array, Array]:
-    """(gradient, hessian) with zeros for what moves no output: its slope is rounding, and a step along it has no end.
+    """Return (gradient, hessian) with zeros for parameters that move no output, whose slopes are only rounding.
 
     ``typical`` (k,): sizes of the parameters; ``cost``: square of the residual.
     """
@@ -123,10 +126,11 @@ def without_unseen(gradient: Array, hessian: Array, typical: Array, cost: float)
 
 
 def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
-    """The damped Gauss-Newton step (k,) that leads lowest within ``least`` and ``most`` (k,).
+    """Return the damped Gauss-Newton step (k,) with the lowest quadratic cost within ``least`` and ``most`` (k,).
 
-    A step that is solved for all parameters and cut afterwards may lead uphill, and a search then ends in a corner
-    that is no minimum. Within bounds the active set decides (P. B. Stark, R. L. Parker, Comput. Stat. 10, 1995).
+    A step that is solved for all parameters and clipped afterwards may increase the cost, and a search then ends in a
+    corner that is no minimum. The active set solves it within bounds (P. B. Stark, R. L. Parker, Comput. Stat. 10,
+    1995).
     """
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     system = hessian / np.outer(scale, scale) + damping * np.eye(scale.size)
@@ -141,10 +145,10 @@ def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, 
 
 
 def _search(projected: Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
-    """Damped Gauss-Newton with bounds; returns theta and the cost.
+    """Search by damped Gauss-Newton steps with bounds; return theta and the cost.
 
-    Between steps the sensitivities are updated from what the step itself showed (Broyden, Mathematics of Computation
-    19, 1965) and measured anew only when that no longer leads downhill.
+    Between steps the sensitivities are updated by the result of the step (Broyden, Mathematics of Computation 19, 1965)
+    and computed again only when that no longer decreases the cost.
     """
     model = projected.model
     free = projected.free
@@ -183,10 +187,10 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
             new = float(trial @ trial)
             if np.isfinite(new) and new < cost:
                 gain = (cost - new) / max(cost, 1e-300)
-                taken = np.array([to_search(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
-                length = float(taken @ taken)
+                moved = np.array([to_search(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
+                length = float(moved @ moved)
                 if length > 0.0:
-                    jacobian += np.outer((trial - residual - jacobian @ taken) / length, taken)
+                    jacobian += np.outer((trial - residual - jacobian @ moved) / length, moved)
                 theta, residual, cost = solved, trial, new
                 damping = max(damping / 6, 1e-8)
                 break
@@ -213,7 +217,7 @@ def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
     return tuple(stuck)
 
 
-@np.errstate(all="ignore")  # trials may run away
+@np.errstate(all="ignore")  # trials may diverge
 def fit(
     problem: Problem,
     model: Model,
@@ -228,11 +232,11 @@ def fit(
     keep: Fit | None = None,
     touched: Sequence[str] = (),
 ) -> Fit:
-    """Best fit over ``starts``. Each start is tried coarsely on few rows; the best two are refined.
+    """Return the best fit over ``starts``. Each start is tried coarsely on few rows; the best two are refined.
 
-    ``stride`` thins the fit rows (the simulation itself keeps every sample). When the coarse search ends above
-    ``hopeless`` (weighted mean square), it is not refined. ``keep``: a fit whose residual stands for every output that
-    shares no parameter with the outputs ``touched``; only these are fitted then.
+    ``stride`` thins the fit rows (the simulation itself keeps every sample). If the coarse search ends above
+    ``hopeless`` (weighted mean square), it is not refined. ``keep`` is a fit whose residual is used for every output
+    that shares no parameter with the outputs ``touched``; then only the latter are fitted.
     """
     outputs = model.together(touched) if keep is not None and touched else problem.twin.outputs
     rows = min(max(1, problem.fit_rows.size // max(1, stride)), MOST_ROWS)
@@ -248,7 +252,7 @@ def fit(
         if len(tried) > 1 and tried[1][0] > (NEAR_INSIDE if inside_of(model.twin) else NEAR) * tried[0][0]:
             best = best[:1]
         if opening is not None and np.isfinite(hopeless):
-            # what it leaves of the opening says nothing about the whole
+            # the cost on the opening does not predict that on the whole
             projected = Projected(problem, model, outputs, few)
             residual, _ = projected.evaluate(best[0])
             left = float(residual @ residual) / max(1.0, projected.usual_count)
@@ -287,13 +291,13 @@ OPENING = frozenset(
         "cubic_stiffness", "cogging", "gravity_load", "centripetal_acceleration", "sensor_position_error",
     )
 )  # fmt: skip
-"""Effects that follow the inputs: where these are the same, so are they. What happens in time (drifts, steps, clocks,
-lines, lost samples) or follows a context may not have happened yet in the first part of a recording.
+"""Effects that depend on the inputs alone. Others depend on time (drifts, steps, clocks, lines, lost samples) or on a
+context and may not occur in the first part of a recording.
 """
 
 
 def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tuple[list[tuple[float, Array]], int]:
-    """(cost per usual sample, theta), best first, of the best ``tries`` starts after a few steps; evaluations."""
+    """Return (cost per usual sample, theta), best first, of the best ``tries`` starts after few steps; evaluations."""
     ranked: list[tuple[float, int, Array]] = []
     for i, theta in enumerate(starts[: 3 * tries]):
         residual, solved = projected.evaluate(theta)
@@ -319,10 +323,10 @@ def _finely(
     rounds: int,
     tolerance: float,
 ) -> tuple[Array, float, int]:
-    """(theta, cost, evaluations) after a search on ``rows`` and another with outliers weighed down."""
+    """Return (theta, cost, evaluations) after a search on ``rows`` and another with reduced weights of outliers."""
     before = 0
     if rows > 2 * SEARCH_ROWS:
-        # the way is found on part of the rows; all of them decide where it ends
+        # the search begins on part of the rows and ends on all of them
         part = Projected(problem, model, outputs, SEARCH_ROWS)
         theta, _ = _search(part, theta, iterations, tolerance)
         before, iterations = part.evaluations, min(iterations, LAST_ITERATIONS)
@@ -339,11 +343,11 @@ def _finely(
 
 
 NOTICED = 1.0
-"""Noise variances: a smaller change of the cost is not noticed."""
+"""Largest change of the cost, in noise variances, that counts as insignificant."""
 
 
 def _put_away(projected: Projected, theta: Array, cost: float) -> tuple[Array, float]:
-    """(theta, cost) with every parameter where it does nothing that the fitted samples do not miss."""
+    """Return (theta, cost) with every insignificant parameter at its value without influence (``Parameter.away``)."""
     for i in projected.free:
         away = projected.model.parameters[i].away
         if away is not None and theta[i] != away and np.isfinite(cost):
@@ -356,23 +360,23 @@ def _put_away(projected: Projected, theta: Array, cost: float) -> tuple[Array, f
 
 
 def as_given(problem: Problem) -> Fit:
-    """The twin as the engineer believes it to be."""
+    """Return the twin as given by the engineer, as a fit."""
     model = problem.base()
     theta = model.start(problem.recording)
     return Fit(model, theta, residuals(problem, model, theta), np.nan, (), 1)
 
 
 POOR = 0.5
-"""Share of the mean square as given: a re-fit that leaves more is tried from other starts too."""
+"""Residual of a re-fit, as a share of the mean square as given, above which other starts are tried, too."""
 ENOUGH = 4.0
-"""Noise variances: a re-fit that leaves less is good enough from one start."""
+"""Residual of a re-fit, in noise variances, below which a single start suffices."""
 FACTORS = ((0.8, 1.0), (1.25, 1.0), (1.0, 3.0), (1.0, 0.33))
-"""Other starts: factors on what is searched by its logarithm (rates, frequencies) and on other searched parameters
-(damping ratios)."""
+"""Factors of other starts on parameters that are searched by their logarithm (rates, frequencies) and on other searched
+parameters (damping ratios)."""
 
 
 def around(model: Model, theta: Array) -> list[Array]:
-    """``theta`` and a few places around it, as starts of a search of the base parameters."""
+    """Return ``theta`` and a few points around it, as starts of a search of the base parameters."""
     out = [theta]
     for rate, other in FACTORS:
         moved = theta.copy()
@@ -385,9 +389,10 @@ def around(model: Model, theta: Array) -> list[Array]:
 
 
 def fit_base(problem: Problem) -> Fit:
-    """The base parameters alone, fitted from where the engineer believes them to be.
+    """Fit the base parameters alone from the engineer's values.
 
-    Where that leads to little, a few places around are tried, too. Never worse on the fitted samples than as given.
+    If that improves little, a few points around are tried, too. The result is never worse on the fitted samples than as
+    given.
     """
     model, given = problem.base(), as_given(problem)
     found = fit(problem, model, [given.theta])
@@ -399,7 +404,7 @@ def fit_base(problem: Problem) -> Fit:
         if others.ok and fit_loss(problem, others.residual) < 0.98 * left:
             found, left = others, fit_loss(problem, others.residual)
     if not (found.ok and left <= believed):
-        # weights that bound outliers may prefer what plain squares do not
+        # the robust cost may prefer a fit that plain squares do not
         found = fit(problem, model, [given.theta], rounds=1)
         left = fit_loss(problem, found.residual)
     return found if found.ok and left <= believed else given

@@ -1,4 +1,4 @@
-"""The physics that a search accepted, as the report lists it: parameters with intervals, how sure, and the rivals."""
+"""Lists the accepted physics for the report: parameters with intervals, probabilities, and rivals."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ Array = NDArray[np.float64]
 
 
 def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str, dict[str, ParameterValue]]:
-    """Human parameters with 95 % intervals by the delta method, per effect label and
-    "base".
-    """
+    """Return human parameters with 95 % intervals by the delta method, per effect label and "base"."""
     model, theta = fitted.model, fitted.theta
     values = model.human(theta)
     flat = np.array([h.value for group in values.values() for h in group])
@@ -44,7 +42,7 @@ def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str
     spread = unsure.spread(gradient)
     read_off = {p.label: half_widths(problem, fitted, k) for k, p in enumerate(model.placed)}
     out: dict[str, dict[str, ParameterValue]] = {}
-    # beyond its bounds a parameter was not searched
+    # the interval is clipped to the bounds within which the parameter was searched
     bounds = {p.name: (p.lo, p.hi) for p in model.parameters[model.n_base :]}
     i = 0
     for label, group in values.items():
@@ -65,7 +63,7 @@ def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: 
         return trial_unit.replace("{in}", u_in).replace("{out}", u_out)
     units = problem.twin.units
     drive = problem.twin.drive(output) or target
-    # a force inside the equation of motion has the unit of what drives it, and what is added to a static twin's
+    # a force inside the equation of motion has the unit of its driving signal, and an addition to a static twin's
     # output is driven by its input
     driven = placed.site == "feedback" or (problem.twin.static and placed.effect.kind == "add")
     source = drive if driven or target not in units else target
@@ -78,7 +76,7 @@ def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: 
 def parameters_of(
     problem: Problem, placed: Placed, output: str, values: Mapping[str, ParameterValue]
 ) -> dict[str, ParameterValue]:
-    """Human parameters of a placed effect with the units of the signals that it stands between."""
+    """Return the human parameters of a placed effect with the units of the adjacent signals."""
     return {
         n: ParameterValue(v.value, _units(problem, v.unit, placed.target, output, placed), v.ci95)
         for n, v in values.items()
@@ -86,7 +84,7 @@ def parameters_of(
 
 
 def physics_found(problem: Problem, fitted: Fit, unsure: Uncertainty, sure: Mapping[str, float]) -> list[PhysicsFound]:
-    """The effects of a model, parameters from the joint fit. ``sure``: the probability of every name."""
+    """Return the effects of a model, parameters from the joint fit. ``sure``: the probability of every name."""
     if not fitted.model.placed:
         return []
     values = human_values(problem, fitted, unsure)
@@ -97,7 +95,7 @@ def physics_found(problem: Problem, fitted: Fit, unsure: Uncertainty, sure: Mapp
         c = compare(problem, small, fitted)
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         if placed.site == "feedback":
-            worst = placed.target if placed.target in small.residual else worst  # whose unit its parameters have
+            worst = placed.target if placed.target in small.residual else worst  # its unit is that of the parameters
         a, b = fitted.model.slices(k)
         raw = {
             fitted.model.parameters[i].name.rsplit(".", 1)[-1]: float(fitted.theta[i])

@@ -1,8 +1,8 @@
-"""Whether an input was held between its samples or ran linearly, where the recording does not say.
+"""Infers the hold of inputs (held or linear between samples) if the recording does not declare it.
 
-To first order the two differ by half a sample of delay, so a twin that runs the wrong one lacks a "dead time" that no
-machine has. The difference of both simulations is regressed on the whitened residual beside everything that the base
-parameters can do (Frisch and Waugh, Econometrica 1, 1933): a share of 0 is linear, of 1 held.
+To first order the two differ by half a sample of delay, so a twin with the wrong one lacks a "dead time" that no
+machine has. The whitened residual is regressed on the difference of both simulations beside the sensitivities to base
+parameters (Frisch and Waugh, Econometrica 1, 1933): a share of 0 is linear, of 1 held.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.twins.make import make
 
 NEAR = 0.3
-"""Distance of the share from 0 or 1 within which it says which of the two it is."""
+"""Largest distance of the share from 0 or 1 at which it decides for that value."""
 CLEAR = 6.0
-"""Standard errors between the share and the other of the two."""
+"""Least distance of the share from the rejected value, in standard errors."""
 
 
-def said_hold(recording: Recording) -> str:
-    """The hold that the recording declares: "zero", "linear", or "" where it says nothing or it does not matter."""
+def declared_hold(recording: Recording) -> str:
+    """Return the hold that the recording declares: "zero", "linear", or "" if none is declared or needed."""
     p = recording.twin.parameters
     return str(p["hold"]) if "hold" in p else ""
 
 
 def holdable(problem: Problem) -> bool:
-    """Return whether the twin's answer depends on what its inputs do between the samples."""
-    return getattr(problem.twin, "hold", "") == "linear" and not said_hold(problem.recording)
+    """Return True if the twin's output depends on the hold of its inputs."""
+    return getattr(problem.twin, "hold", "") == "linear" and not declared_hold(problem.recording)
 
 
 def with_hold(recording: Recording, kind: str) -> Recording:
-    """The same recording with inputs that do this between the samples."""
+    """Return the same recording with inputs of this hold."""
     return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": kind}))
 
 
 def as_held(problem: Problem, kind: str = "zero") -> Problem:
-    """The same problem with inputs that do this between the samples."""
+    """Return the same problem with inputs of this hold."""
     recording = with_hold(problem.recording, kind)
     twin = make(recording)
     if hasattr(twin, "restart") and twin.restart != problem.twin.restart:
@@ -55,10 +55,10 @@ def as_held(problem: Problem, kind: str = "zero") -> Problem:
 
 
 def infer_hold(problem: Problem, base: Fit) -> Hold:
-    """Return which hold the data show. ``base``: the twin with its parameters re-fitted, inputs linear.
+    """Return the hold that the data show. ``base``: the twin with its parameters re-fitted, inputs linear.
 
-    Parameters that were fitted with the wrong hold have bent to it. Where the share lies nearer to held, it is
-    estimated once more from parameters that were fitted with held inputs, and that estimate counts.
+    A fit with the wrong hold biases the parameters. If the share is nearer to held, it is estimated once more from
+    parameters that were fitted with held inputs, and that estimate counts.
     """
     other = as_held(problem)
     share, spread = _share(problem, base, problem, other)
@@ -81,9 +81,9 @@ def infer_hold(problem: Problem, base: Fit) -> Hold:
 
 
 def _smooth(problem: Problem, base: Fit) -> Hold | None:
-    """Smooth inputs, where the data ask for all of the difference that they make to straight ones; else None.
+    """Return a smooth hold if the data support its full difference to a linear one; else None.
 
-    A twin that cannot have them says so with its RecordingError, and is left as it is.
+    A twin that cannot have it raises RecordingError, and is not changed.
     """
     try:
         other = as_held(problem, "smooth")
@@ -96,12 +96,13 @@ def _smooth(problem: Problem, base: Fit) -> Hold | None:
 
 
 def _share(problem: Problem, fitted: Fit, linear: Problem, zero: Problem) -> tuple[float, float]:
-    """How much of the difference between held and linear inputs the residual of ``fitted`` (of ``problem``) asks for,
-    and its standard error; (nan, inf) when nothing differs.
+    """Estimate the share of the difference between held and linear inputs in the residual of ``fitted``.
+
+    Returns the share and its standard error; (nan, inf) if there is no difference. ``fitted`` belongs to ``problem``.
     """
     with np.errstate(all="ignore"):
-        there = Model(zero.twin).simulate(zero.view, fitted.theta)
-        here = Model(linear.twin).simulate(linear.view, fitted.theta)
+        held = Model(zero.twin).simulate(zero.view, fitted.theta)
+        straight = Model(linear.twin).simulate(linear.view, fitted.theta)
     rows, spans = problem.fit_rows, problem.fit_spans
     slopes = jacobian(problem, fitted)
     residual: list[np.ndarray] = []
@@ -109,7 +110,7 @@ def _share(problem: Problem, fitted: Fit, linear: Problem, zero: Problem) -> tup
     for k, o in enumerate(problem.twin.outputs):
         filters = fit_whitener(fitted.residual[o], stretches=spans)
         usable = [s for s in spans if s[1] - s[0] > filters.warm_up + 4]
-        change = there[o] - here[o]
+        change = held[o] - straight[o]
         if not usable or not np.all(np.isfinite(change)) or not np.any(change):
             continue
         scale = 1.0 / problem.sigma(o)
@@ -127,7 +128,7 @@ def _share(problem: Problem, fitted: Fit, linear: Problem, zero: Problem) -> tup
 
 
 def _first_coefficient(x: np.ndarray, e: np.ndarray) -> tuple[float, float]:
-    """Least-squares coefficient of the first column of ``x`` (n, k) beside the others, and its standard error."""
+    """Return the least-squares coefficient of the first column of ``x`` (n, k) and its standard error."""
     first, others = x[:, 0], x[:, 1:]
     own = first - others @ np.linalg.lstsq(others, first, rcond=1e-10)[0] if others.shape[1] else first
     rest = e - others @ np.linalg.lstsq(others, e, rcond=1e-10)[0] if others.shape[1] else e
@@ -144,7 +145,7 @@ NO_WORSE = 1.02
 
 
 def delay_is_hold(problem: Problem, fitted: Fit) -> bool:
-    """Whether the model has a delay of half a sample in whose place held inputs explain the held-out part as well."""
+    """Return True if the model has a delay of half a sample and held inputs explain the held-out part as well."""
     half = 0.5 * problem.recording.dt
     values = human_values(problem, fitted, uncertainty(problem, fitted))
     for k, placed in enumerate(fitted.model.placed):

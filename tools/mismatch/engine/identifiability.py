@@ -1,4 +1,4 @@
-"""What a recording cannot tell: effects that look alike, effects it cannot show, the smallest it would name."""
+"""Determines the limits of a recording: indistinguishable effects, invisible effects, detection limits."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ EXPERIMENTS: dict[frozenset[str], str] = {
 
 
 def experiment(a: Effect, b: Effect) -> str:
-    """The recording that would split two effects."""
+    """Return the recording that would split two effects."""
     known = EXPERIMENTS.get(frozenset((a.name, b.name)))
     if known:
         return known
@@ -75,8 +75,10 @@ def experiment(a: Effect, b: Effect) -> str:
 
 @dataclass(frozen=True)
 class LeastNamed:
-    """What an effect of one parameter on one output must show to be named: the ``z`` of its test, and the ``gain`` as a
-    share of the held-out mean square."""
+    """Holds the thresholds for naming an effect of one parameter on one output.
+
+    ``z`` is that of its test; ``gain`` is a share of the held-out mean square.
+    """
 
     z: float
     gain: float
@@ -84,8 +86,10 @@ class LeastNamed:
 
 @dataclass(frozen=True)
 class Limits:
-    """``limit[output][effect]`` the smallest effect rms in the output's unit that would have been named; effects
-    that the excitation cannot show are in ``cannot`` with what a recording would need.
+    """Holds the detection limits of a recording.
+
+    ``limit[output][effect]`` is the smallest effect rms in the output's unit that would have been named; ``cannot``
+    lists the effects that the excitation cannot show, with the requirement on a recording.
     """
 
     limit: dict[str, dict[str, float]]
@@ -95,7 +99,7 @@ class Limits:
 def directions(
     problem: Problem, current: Fit, placed: Placed, starts: Sequence[Array] | None = None, most: int = 3
 ) -> list[dict[str, Array]]:
-    """How the simulated outputs move for a weak effect: per start and weight, output -> (m,) on the view."""
+    """Return the response of the simulated outputs to a weak effect: per start and weight, output -> (m,)."""
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
     out: list[dict[str, Array]] = []
@@ -112,15 +116,15 @@ def directions(
                 if move:
                     out.append(move)
             if not out:
-                here = model.simulate(problem.view, start, placed.outputs)
+                before = model.simulate(problem.view, start, placed.outputs)
                 for j in range(weights.start, weights.stop):
                     pushed = start.copy()
                     pushed[j] += model.parameters[j].scale * 1e-3
-                    there = model.simulate(problem.view, pushed, placed.outputs)
-                    out.append({o: there[o] - here[o] for o in there})
+                    after = model.simulate(problem.view, pushed, placed.outputs)
+                    out.append({o: after[o] - before[o] for o in after})
         else:
-            there = model.simulate(problem.view, start, placed.outputs)
-            out.append({o: there[o] - (problem.measured[o] - current.residual[o]) for o in there})
+            after = model.simulate(problem.view, start, placed.outputs)
+            out.append({o: after[o] - (problem.measured[o] - current.residual[o]) for o in after})
     return out
 
 
@@ -133,10 +137,10 @@ def detection(
     *,
     known: Mapping[tuple[str, ...], tuple[Placed, Sequence[Array]]] | None = None,
 ) -> Limits:
-    """Smallest effect rms per output and effect that would have been named beside ``current``.
+    """Return the smallest effect rms per output and effect that would have been named beside ``current``.
 
-    From the noncentrality of the held-out score test at its threshold (plus one standard deviation, so that it is
-    named five times in six) and from the least gain, after what the base parameters would absorb. ``known``: places
+    It follows from the noncentrality of the held-out score test at its threshold (plus one standard deviation, so that
+    it is named five times in six) and from the least gain, less the part that base parameters absorb. ``known``: places
     that were screened already, with their settings and starts, by (name, kind, site, target).
     """
     limit: dict[str, dict[str, float]] = {o: {} for o in problem.twin.outputs}

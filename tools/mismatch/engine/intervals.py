@@ -1,4 +1,4 @@
-"""How sure fitted parameters are: colour, few blocks and a wrong form widen their intervals."""
+"""Estimates the uncertainty of fitted parameters: colour, few blocks and a wrong form widen their intervals."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Rows = NDArray[np.int64]
 
 
 def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
-    """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters).
+    """Return the sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters).
 
-    The steps of a quantiser have no slope that says anything: what lies before it is moved without it.
+    The steps of a quantiser have no meaningful slope, so parameters in front of it are moved without it.
     """
     model, theta = fitted.model, fitted.theta
     rows = problem.fit_rows[:: max(1, stride)]
@@ -45,7 +45,7 @@ def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
 
 
 def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Array, which: Sequence[int]) -> Array:
-    """``found`` with the columns of these parameters from differences of two simulations."""
+    """Return ``found`` with the columns of these parameters from differences of two simulations."""
     stack = lambda y: np.concatenate([y[o][rows] / problem.sigma(o) for o in problem.twin.outputs])  # noqa: E731
     here = stack(model.simulate(problem.view, theta)) if which else np.zeros(0)
     for i in which:
@@ -58,13 +58,15 @@ def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Arra
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the fitted parameters may be off by. Three accounts of it are kept apart, and the largest counts for each
-    quantity: weights that cancel one another leave their sum sure however unsure each is, and one matrix made of the
-    largest variances would not know that.
+    """Holds the uncertainty of fitted parameters.
 
-    ``moved`` (blocks, parameters): what each block of the data shifts them by; ``plain`` and ``coloured`` (parameters,
-    parameters): their covariance if the residual were white, and if it had the spectrum of its autoregression;
-    ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form of the model.
+    Three estimates are kept separately, and the largest counts for each quantity. Weights that cancel each other have a
+    certain sum although each is uncertain, which a single matrix of the largest variances would not express.
+
+    ``moved`` (blocks, parameters): shift of the parameters by each block of the data; ``plain`` and ``coloured``
+    (parameters, parameters): their covariance for a white residual, and for one with the spectrum of its
+    autoregression; ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form
+    of the model.
     """
 
     moved: Array
@@ -74,8 +76,9 @@ class Uncertainty:
     beyond: float
 
     def spread(self, gradients: Array) -> Array:
-        """Standard deviations (k,) of quantities with these ``gradients`` (k, parameters); 1.96 of them either way are
-        a 95 % interval.
+        """Return standard deviations (k,) of quantities with these ``gradients`` (k, parameters).
+
+        A 95 % interval is 1.96 of them either way.
         """
         moved = self.moved @ gradients.T
         accounts = [np.sum(moved**2, axis=0) * few_blocks(moved) ** 2]
@@ -83,8 +86,10 @@ class Uncertainty:
         return np.sqrt(np.maximum(np.max(accounts, axis=0), 0.0) * self.beyond + gradients**2 @ self.own)
 
     def chance_of_none(self, values: Array, which: slice) -> float:
-        """The p-value that the parameters ``which`` of ``values`` (parameters,) are all zero (Wald's test), by the
-        account that makes it likeliest: parameters that cancel one another are sure together and unsure each.
+        """Return the p-value that the parameters ``which`` of ``values`` (parameters,) are all zero (Wald's test).
+
+        The estimate with the largest p-value counts. Parameters that cancel each other are jointly certain although
+        each is uncertain.
         """
         v = values[which]
         accounts = (
@@ -100,15 +105,17 @@ class Uncertainty:
         return float(chi2.sf(least / self.beyond, max(v.size, 1)))
 
     def deviations(self) -> Array:
-        """Standard deviation of each parameter (parameters,)."""
+        """Return the standard deviation of each parameter (parameters,)."""
         return self.spread(np.eye(self.own.size))
 
 
 def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
-    """How sure the parameters are: what each block shifts them by (block-clustered sandwich, Liang and Zeger,
-    Biometrika 73, 1986), wider where few blocks carry a quantity (Student's t with Satterthwaite's degrees of
-    freedom), never below what the residual's own colour or white residuals would give. What held-out samples leave
-    beyond the fit is the form of the model, and counts. A parameter that the data do not move is as wide as its bounds.
+    """Estimate the uncertainty of the parameters of a fit.
+
+    It is the shift by each block (block-clustered sandwich, Liang and Zeger, Biometrika 73, 1986), wider if few blocks
+    carry a quantity (Student's t with Satterthwaite's degrees of freedom), and never below that of the residual's own
+    colour or of white residuals. A larger residual on held-out samples is an error of the model's form, and counts. A
+    parameter that the data do not move is as wide as its bounds.
     """
     stride = max(1, problem.fit_rows.size * len(problem.twin.outputs) // 200_000)
     j = jacobian(problem, fitted, stride)
@@ -136,25 +143,25 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
 
 
 def few_blocks(moved: Array) -> Array:
-    """Student's quantile over the normal one (parameters,) for what each block ``moved`` (blocks, parameters)."""
+    """Return Student's quantile over the normal one (parameters,) for the shifts ``moved`` (blocks, parameters)."""
     share = moved**2
     freedom = np.sum(share, axis=0) ** 2 / np.maximum(np.sum(share**2, axis=0), 1e-300)
     return student.ppf(0.975, np.clip(freedom, 3.0, None)) / 1.96
 
 
 def _coloured_meat(problem: Problem, js: Array, r: Array) -> Array:
-    """Covariance (parameters, parameters) of the scores when the residual has the spectrum of its autoregression."""
+    """Return the covariance (parameters, parameters) of the scores by the spectrum of the residual's autoregression."""
     m = problem.fit_rows.size
     out = np.zeros((js.shape[1], js.shape[1]))
     cuts = np.flatnonzero(np.diff(problem.fit_rows) != 1) + 1
     spans = list(zip(np.r_[0, cuts].tolist(), np.r_[cuts, m].tolist(), strict=True))
     for i in range(len(problem.twin.outputs)):
-        mine = slice(i * m, (i + 1) * m)
-        e, slopes = r[mine], js[mine]
+        rows = slice(i * m, (i + 1) * m)
+        e, slopes = r[rows], js[rows]
         whitener = fit_whitener(e, stretches=spans)
         for a, b in spans:
             waves = np.fft.rfft(slopes[a:b], axis=0)
-            # one-sided spectrum: all but the ends stand for two
+            # the spectrum is one-sided: all bins but the ends count twice
             twice = np.full(waves.shape[0], 2.0)
             twice[0] = 1.0
             if (b - a) % 2 == 0:
@@ -165,17 +172,17 @@ def _coloured_meat(problem: Problem, js: Array, r: Array) -> Array:
 
 
 def _beyond_fit(problem: Problem, fitted: Fit) -> float:
-    """Mean square on held-out samples over that on fitted ones, at least 1, outliers bounded alike."""
+    """Return the mean square on held-out samples over that on fitted ones, at least 1, outliers bounded alike."""
     ratio = 1.0
     for o, r in fitted.residual.items():
         limit = HUBER * robust_scale(r[problem.fit_rows], problem.sigma(o))
-        there, here = (float(np.mean(np.clip(r[k], -limit, limit) ** 2)) for k in (problem.held_rows, problem.fit_rows))
-        ratio = max(ratio, there / max(here, 1e-300))
+        held, here = (float(np.mean(np.clip(r[k], -limit, limit) ** 2)) for k in (problem.held_rows, problem.fit_rows))
+        ratio = max(ratio, held / max(here, 1e-300))
     return ratio
 
 
 def _ranges(fitted: Fit) -> Array:
-    """Widths of the bounds (parameters,); of an unbounded one that of its prior, or its scale where it has none."""
+    """Return the widths of the bounds (parameters,); for an unbounded one that of its prior, or else its scale."""
     model = fitted.model
     wide = np.array([p.hi - p.lo for p in model.parameters])
     scale = np.array([abs(p.scale) for p in model.parameters])

@@ -1,4 +1,4 @@
-"""Two recordings as one: fitted on the first, held out on the second, as benchmark data come."""
+"""Joins two recordings: fitted on the first, held out on the second, as benchmark data are supplied."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tools.mismatch.recording_load import load
 
 
 def joined(recording: Recording) -> tuple[Recording, bool]:
-    """The recording with the other one that its ``[split]`` names appended (or put in front); True when that was so.
+    """Join the recording with the other one that its ``[split]`` names, in front or behind; True if it names one.
 
-    RecordingError when the two do not have the same channels and rate.
+    Raises RecordingError if the two do not have the same channels and rate.
     """
     split = recording.split
     if isinstance(split.test, Path):
@@ -24,7 +24,7 @@ def joined(recording: Recording) -> tuple[Recording, bool]:
         test = other.split.test if isinstance(other.split.test, tuple) else (0, other.n)
         first, second = recording, other
     elif isinstance(split.fit, Path) and not split.fit.is_file():
-        # fitted on several recordings: no single one stands for them, so this one is split by itself
+        # the twin was fitted on several recordings, so this one is split by itself
         return replace(recording, split=Split()), False
     elif isinstance(split.fit, Path) and isinstance(split.test, tuple):
         other = load(split.fit)

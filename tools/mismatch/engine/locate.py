@@ -1,4 +1,4 @@
-"""Where a mismatch sits: outputs, windows, regime, and which recorded signal it follows."""
+"""Locates a mismatch: outputs, windows, regime, and the recorded signal that it follows."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> tuple[Array, dict[str, Array], float]:
-    """Residual, recorded signals and step on the view's samples, block-averaged to ``limit`` samples."""
+    """Return residual, recorded signals and step on the view's samples, block-averaged to ``limit`` samples."""
     index = problem.index
     k = max(1, int(np.ceil(index.size / limit)))
     m = index.size // k
@@ -39,12 +39,12 @@ def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> t
 
 
 def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
-    """Return what the residual of one output follows, strongest first, and the p-value that history adds nothing.
+    """Return the features that the residual of an output follows, strongest first, and the p-value of no memory.
 
-    Both its mean and its size are looked at: bursts have no mean that follows, but a size that does.
+    Both the mean and the size of the residual are tested: the mean of bursts follows nothing, but their size may.
     """
     e, signals, dt = thinned(problem, fitted, output)
-    # a plant's own motion is what friction, springs and play follow; a reading made of several inputs, what a gain does
+    # friction, springs and play follow a plant's own motion; a gain follows a reading that is made of several inputs
     motion = problem.measured[output] - fitted.residual[output]
     k = max(1, round(dt / problem.recording.dt))
     motion = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
@@ -60,7 +60,7 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
 
 
 def follow_size(problem: Problem, fitted: Fit, output: str) -> list[Dependence]:
-    """Return what the size of the residual follows (its logarithm, floored at the noise), strongest first."""
+    """Return the features that the size of the residual follows (logarithm, floored at the noise), strongest first."""
     e, signals, dt = thinned(problem, fitted, output)
     size = np.log(e**2 + (0.5 * problem.sigma(output)) ** 2)
     features = [f for f in features_of(signals, dt, pairs=False) if f.kind in ("value", "rate", "amplitude")]
@@ -68,7 +68,7 @@ def follow_size(problem: Problem, fitted: Fit, output: str) -> list[Dependence]:
 
 
 def regime(problem: Problem, fitted: Fit, output: str) -> str:
-    """In words, where the residual is worst: the regime variable whose upper and lower parts differ most."""
+    """Return in words where the residual is worst: the regime variable whose upper and lower parts differ most."""
     e, signals, dt = thinned(problem, fitted, output)
     blocks = max(2, min(120, max(12, e.size // 50), e.size // 4))
     edges = np.linspace(0, e.size, blocks + 1).astype(int)
@@ -121,8 +121,10 @@ def regime(problem: Problem, fitted: Fit, output: str) -> str:
 def windows(
     problem: Problem, fitted: Fit, outputs: list[str], loudest: Mapping[str, float] | None = None
 ) -> list[tuple[float, float]]:
-    """Time windows in which any of ``outputs`` stands above its noise (``loudest``: the most that this may be), seconds
-    of the recording. Where nearly all of the record does, those that hold most of what stands above it.
+    """Return the time windows, in s of the recording, in which any of ``outputs`` exceeds its noise.
+
+    ``loudest`` is the upper end of the noise. If nearly all of the record exceeds it, the windows with most of the
+    excess are returned.
     """
     noise = {o: max((loudest or {}).get(o, 0.0), problem.sigma(o)) for o in outputs}
     t = problem.recording.t[problem.index] - problem.recording.t[0]
@@ -142,7 +144,7 @@ def windows(
 
 
 def excess_share(e: Array, noise_rms: float) -> float:
-    """Return how far a residual stands above its noise: mean square over noise variance."""
+    """Return the mean square of a residual over the noise variance."""
     return float(np.mean(e**2) / noise_rms**2) if noise_rms > 0 else np.inf
 
 

@@ -1,4 +1,4 @@
-"""Several recordings of one system: leave one out, one estimate each, and what these follow."""
+"""Compares recordings of a system: leave-one-out scores, estimates in each, and the conditions that these follow."""
 
 from __future__ import annotations
 
@@ -24,25 +24,26 @@ from tools.mismatch.simulate_view import View
 Array = NDArray[np.float64]
 
 MOST_FOLDS = 20
-"""Folds of the held-out score. More recordings are left out in groups, so that time grows with their length only."""
+"""Largest number of folds of the held-out score. More recordings are left out in groups, so that the computing time
+grows with their length only."""
 LEVEL = 0.005
-"""Corrected p-value below which a change between recordings is named: one family in 200 without any change."""
+"""Corrected p-value below which a change between recordings is named: a false one in 200 families."""
 LEAST_RECORDINGS = 4
-"""Recordings below which nothing is said of what changes between them."""
+"""Least number of recordings for which changes between them are reported."""
 ORDER = "order"
-"""The condition that every family has: the place of a recording in the command."""
+"""Name of the condition that every family has: the place of a recording in the command."""
 SAME_INPUT = 1e-3
 """Largest difference of two inputs, as a share of the range, that still counts as a repeat."""
 
 
 def repeated_noise(recording: Recording, output: str) -> float | None:
-    """Noise rms of an output from pairs of recordings with the same inputs, None where there are none.
+    """Estimate the noise rms of an output from pairs of recordings with the same inputs; None without such pairs.
 
-    Half the variance of the difference of two such recordings. An offset and a scale between the two are taken out,
-    for they may belong to what changes between recordings; the first tenth is left out, for they may start differently.
+    It is half the variance of the difference of two such recordings. An offset and a scale between the two are removed,
+    because they may change between recordings; the first tenth is left out, because start states may differ.
     """
     found: list[float] = []
-    # neighbours among equals are enough, and the number of pairs stays linear
+    # pairs of neighbours are enough and keep the number of pairs linear
     for a, b in itertools.pairwise(recording.parts):
         n = b.stop - b.start
         if a.stop - a.start != n or not all(
@@ -61,7 +62,7 @@ def _alike(x: Array, y: Array) -> bool:
 
 
 def free_names(model: Model) -> dict[str, int]:
-    """Index of each parameter by the names that ``--per-recording`` may use: ``gain`` and ``gain_um_per_V``."""
+    """Return the index of each parameter by the names for ``--per-recording``: ``gain`` and ``gain_um_per_V``."""
     out: dict[str, int] = {}
     for i, p in enumerate(model.parameters):
         if p.placed >= 0:
@@ -74,22 +75,22 @@ def free_names(model: Model) -> dict[str, int]:
 
 
 def freed(model: Model, names: Sequence[str]) -> tuple[int, ...]:
-    """Indices of the parameters that are free in each recording; the name of an effect alone frees all it has."""
+    """Return indices of the parameters that are free in each recording; the name of an effect frees all of its own."""
     known = free_names(model)
     found = {i for n in names for k, i in known.items() if k == n or k.startswith(n + ".")}
     return tuple(sorted(found))
 
 
 def everything(problem: Problem) -> Problem:
-    """The same problem with all recordings fitted and none held out."""
-    begun = tuple(sorted((*problem.split.fit, *((a - problem.init, b) for a, b in problem.split.held_out))))
-    return replace(problem, split=Split(problem.recording.n, begun, (), (), cut(begun, 48), own=False))
+    """Return the same problem with all recordings fitted and none held out."""
+    spans = tuple(sorted((*problem.split.fit, *((a - problem.init, b) for a, b in problem.split.held_out))))
+    return replace(problem, split=Split(problem.recording.n, spans, (), (), cut(spans, 48), own=False))
 
 
 def levelled(problem: Problem, base: Fit) -> Recording:
-    """The recording with what its free base parameters do in each part taken off the outputs.
+    """Remove the contribution of free base parameters in each part from the outputs of a recording.
 
-    The search for effects then sees one value for all parts. Parameters of effects are no matter of this.
+    The search for effects then uses one value for all parts. Parameters of effects are not affected.
     """
     rec, whole = problem.recording, everything(problem)
     names = freed(base.model, rec.per_recording)
@@ -117,8 +118,10 @@ def _alone(recording: Recording, part: Part) -> Recording:
 
 
 def part_estimates(problem: Problem, fitted: Fit, which: Sequence[int]) -> tuple[Array, Array]:
-    """How far the parameters ``which`` of each recording lie from the shared ones, to first order (one step of
-    Gauss-Newton), and their standard errors, widened by the colour of the residual: (parts, parameters) each.
+    """Estimate the deviations of the parameters ``which`` of each recording from the shared ones, to first order.
+
+    Returns the deviations (one Gauss-Newton step) and their standard errors, widened by the colour of the residual,
+    (parts, parameters) each.
     """
     columns = jacobian(problem, fitted)[:, list(which)]
     rows = problem.fit_rows
@@ -151,8 +154,8 @@ def fold(
 ) -> tuple[tuple[int, ...], dict[str, Array], dict[str, Array]]:
     """Fit both models without the recordings ``out`` and return what they leave there, (samples,) per output."""
     rec = problem.recording
-    begun = everything(problem).split.fit
-    left_out = leave_out(rec.n, begun, out, init=problem.init)
+    spans = everything(problem).split.fit
+    left_out = leave_out(rec.n, spans, out, init=problem.init)
     without = replace(problem, split=left_out)
     found: list[dict[str, Array]] = []
     for known in (base, fitted):
@@ -163,9 +166,7 @@ def fold(
 
 
 def compare_recordings(problem: Problem, base: Fit, fitted: Fit, jobs: int = 1) -> Together:
-    """Score the model on each recording that a fit left out, estimate its parameters in each, and test what they
-    follow.
-    """
+    """Score the model on each left-out recording, estimate its parameters in each, and test what they follow."""
     parts = problem.recording.parts
     groups = [tuple(int(i) for i in g) for g in np.array_split(np.arange(len(parts)), min(len(parts), MOST_FOLDS))]
     folds = mapped(problem, fold, [(problem, base, fitted, g) for g in groups], jobs)
@@ -199,7 +200,7 @@ def compare_recordings(problem: Problem, base: Fit, fitted: Fit, jobs: int = 1) 
 
 
 def _one_sided(gain: Array) -> float:
-    """P-value of Student's t-test that the mean of ``gain`` (folds,) is not above zero."""
+    """Return the p-value of Student's t-test that the mean of ``gain`` (folds,) is not above zero."""
     t = float(np.mean(gain)) / (float(np.std(gain, ddof=1)) / np.sqrt(gain.size))
     return float(stats.t.sf(t, gain.size - 1))
 
@@ -207,13 +208,13 @@ def _one_sided(gain: Array) -> float:
 def in_words(
     recording: Recording, model: Model, theta: Array, deltas: Array, errors: Array, free: Sequence[int]
 ) -> tuple[BetweenRecordings, ...]:
-    """Estimates of the parameters that people read, from deviations (parts, parameters) of the searched ones."""
+    """Return estimates of the human parameters from deviations (parts, parameters) of the searched ones."""
 
     def values(at: Array) -> dict[tuple[str, str], tuple[float, str]]:
         return {(g, h.name): (float(h.value), h.unit) for g, found in model.human(at).items() for h in found}
 
     here = values(theta)
-    # a parameter that people read is free where a searched one moves it
+    # a human parameter is free if a free searched one moves it
     loose = {
         k
         for i in free
@@ -234,11 +235,11 @@ def in_words(
     for (group, name), (_, unit) in here.items():
         found = np.array([v[(group, name)][0] for v in each])
         if group != "base" and (group, name) not in loose:
-            continue  # it moves only because the base does
+            continue  # only the base moves it
         if np.all(np.isfinite(found)) and np.ptp(found) > 1e-9 * np.max(np.abs(found)):
-            said = name if group == "base" else f"{group}.{name}"
+            label = name if group == "base" else f"{group}.{name}"
             se = tuple(float(s[(group, name)]) for s in spread)
-            out.append(BetweenRecordings(said, unit, (group, name) in loose, tuple(map(float, found)), se))
+            out.append(BetweenRecordings(label, unit, (group, name) in loose, tuple(map(float, found)), se))
     return tuple(out)
 
 
@@ -249,7 +250,7 @@ def _only(x: Array, i: int) -> Array:
 
 
 def conditions_of(recording: Recording) -> dict[str, tuple[Condition, ...]]:
-    """Conditions that every recording states in the same form, the means of context channels, and the order."""
+    """Return the conditions that every recording states in the same form, means of context channels, and the order."""
     parts = recording.parts
     out: dict[str, tuple[Condition, ...]] = {ORDER: tuple(float(i + 1) for i in range(len(parts)))}
     for name in dict.fromkeys(k for p in parts for k in p.conditions):
@@ -266,9 +267,10 @@ def conditions_of(recording: Recording) -> dict[str, tuple[Condition, ...]]:
 def changes_between(
     parameters: Sequence[BetweenRecordings], conditions: Mapping[str, tuple[Condition, ...]]
 ) -> tuple[tuple[Change, ...], int]:
-    """The parameters that follow a condition, and how many pairs were tried (Bonferroni's correction).
+    """Return the parameters that follow a condition, and the number of tested pairs (Bonferroni's correction).
 
-    Numbers by the t-test of a straight line, words by the F-test of one mean per word (one-way analysis of variance).
+    Numbers are tested by the t-test of a straight line, words by the F-test of one mean per word (one-way analysis of
+    variance).
     """
     pairs: list[tuple[BetweenRecordings, str, float | None, float]] = []
     for p in parameters:
@@ -278,18 +280,18 @@ def changes_between(
                 pairs.append((p, name, *tested))
     changes: list[Change] = []
     for p in parameters:
-        mine = sorted(((min(1.0, q * len(pairs)), n, s) for x, n, s, q in pairs if x is p), key=lambda m: m[0])
-        if not mine or not mine[0][0] < LEVEL:
+        tests = sorted(((min(1.0, q * len(pairs)), n, s) for x, n, s, q in pairs if x is p), key=lambda m: m[0])
+        if not tests or not tests[0][0] < LEVEL:
             continue
-        q, name, slope = mine[0]
+        q, name, slope = tests[0]
         mean = abs(float(np.mean(p.values)))
-        same = tuple(n for other, n, _ in mine[1:] if other < LEVEL)
+        same = tuple(n for other, n, _ in tests[1:] if other < LEVEL)
         changes.append(Change(p.name, name, slope, None if slope is None or mean == 0 else slope / mean, q, same))
     return tuple(sorted(changes, key=lambda c: c.p_value)), len(pairs)
 
 
 def _test(values: Array, condition: Sequence[Condition]) -> tuple[float | None, float] | None:
-    """(slope, p-value) of values (parts,) against a condition, None where there is too little to test."""
+    """Return (slope, p-value) of values (parts,) against a condition, None if there are too few to test."""
     if values.size < LEAST_RECORDINGS:
         return None
     if all(isinstance(c, float) for c in condition):

@@ -1,11 +1,12 @@
-"""How loud the instrument itself is: the noise floor of an output, and the interval that it lies in.
+"""Estimates the noise floor of an output, and the interval that contains it.
 
-Five witnesses: what the recording declares; periods of the excitation, whose misfit is the same in each; stretches in
-which every input rests; the flat upper part of the residual's spectrum (median over frequency, so that lines do not
-count, after clipping, so that spikes do not count); the lattice of a quantised output or its declared resolution.
+There are five sources: the declaration of the recording; periods of the excitation, whose misfit is the same in each;
+stretches in which every input rests; the flat upper part of the residual's spectrum (median over frequency, so that
+lines do not count, after clipping, so that spikes do not count); the lattice of a quantised output or its declared
+resolution.
 
-A spectrum bounds the noise from below only: a sensor behind a low-pass has little of its noise in the upper part. How
-far up the floor may lie is then said by what the residual follows (``floor_interval``).
+A spectrum is only a lower bound of the noise: a sensor behind a low-pass has little of its noise in the upper part. The
+upper bound then follows from the part of the residual that follows signals (``floor_interval``).
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Noise of one output, in its unit.
+    """Holds the noise of an output, in its unit.
 
-    ``rms`` the whole noise; ``standard_error`` of it; ``white_rms`` the flat part (equal to ``rms`` unless the noise
-    is coloured); ``step`` the quantisation step that the samples sit on, 0 when none shows; ``method`` one of
-    declared, repeats, rest, spectrum; ``coloured`` says that the spectrum keeps falling to its end. ``most``: the
-    noise is no louder than this, by periods or stretches at rest (infinite: there were none).
+    ``rms`` is the whole noise and ``standard_error`` its error; ``white_rms`` is the flat part (equal to ``rms`` unless
+    the noise is coloured); ``step`` is the quantisation step of the samples, 0 if none is visible; ``method`` is one of
+    declared, repeats, rest, spectrum; ``coloured`` is True if the spectrum falls up to its end. ``most`` is the upper
+    bound from periods or stretches at rest (infinite without any).
     """
 
     rms: float
@@ -47,7 +48,7 @@ class NoiseFloor:
 
 
 def clip_spikes(e: Array, threshold: float = 15.0) -> Array:
-    """``e`` (n,) with isolated outliers against a running median replaced by that median.
+    """Return ``e`` (n,) with isolated outliers replaced by the running median.
 
     The threshold is wide, so that noise with heavy tails keeps them. The scale is that of second differences:
     a steep signal equals its running median almost everywhere.
@@ -63,7 +64,7 @@ def clip_spikes(e: Array, threshold: float = 15.0) -> Array:
 
 
 def lattice_step(y: Array) -> float:
-    """Step of the lattice on which ``y`` (n,) sits exactly (to 1e-6 of the step); 0 when there is none."""
+    """Return the step of the lattice on which ``y`` (n,) lies (to 1e-6 of the step); 0 if there is none."""
     values = np.unique(y)
     if values.size < 3 or values.size > 0.5 * y.size:
         return 0.0
@@ -80,14 +81,14 @@ def lattice_step(y: Array) -> float:
 
 
 def _band_levels(e: Array, rate_hz: float) -> tuple[Array, Array, int]:
-    """Median spectral density in equal bands (frequencies, rms had the level been flat, averages)."""
+    """Return the median spectral density in equal bands: (frequencies, rms of a flat spectrum, number of averages)."""
     segment = int(min(e.size, max(64, 1 << int(np.log2(max(e.size // 24, 64))))))
     frequency, density = welch(e, rate_hz, nperseg=segment, detrend="linear")
     averages = max(1, 2 * e.size // segment - 1)
     inner = slice(max(2, frequency.size // 40), -max(1, frequency.size // 40))
     bands = max(4, min(16, frequency[inner].size // 4))
     fs = np.array([b.mean() for b in np.array_split(frequency[inner], bands)])
-    # median of a mean of K exponentials is below its mean by about the factor (1 - 1/(9K/1.8))^3
+    # the median of a mean of K exponentials is below its mean by about the factor (1 - 1/(9K/1.8))^3
     k = max(1.0, averages / 1.8)
     bias = (1 - 1 / (9 * k)) ** 3
     levels = np.array([np.median(b) for b in np.array_split(density[inner], bands)]) / bias
@@ -95,10 +96,10 @@ def _band_levels(e: Array, rate_hz: float) -> tuple[Array, Array, int]:
 
 
 def spectral_floor(e: Array, rate_hz: float) -> tuple[float, float, bool]:
-    """White level of a residual ``e`` (n,): (rms, standard error, does the spectrum fall to its very end).
+    """Estimate the white level of a residual ``e`` (n,): (rms, standard error, True if the spectrum falls to its end).
 
-    Spikes are taken out where that lowers the level: each is white by itself. Where it raises the level no spikes were
-    taken but the peaks of a signal whose amplitude varies, and the cuts are broad-band.
+    Spikes, which are white, are removed if that lowers the level. If it raises the level, the removed samples were
+    peaks of a signal with varying amplitude, and the cuts are broad-band.
     """
     e = np.asarray(e, float)
     found = _level_of(e, rate_hz)
@@ -117,7 +118,7 @@ def _level_of(e: Array, rate_hz: float) -> tuple[float, float, bool]:
     _, levels, averages = _band_levels(e, rate_hz)
     order = np.sort(levels)
     quiet = order[: max(2, int(np.ceil(0.4 * order.size)))]
-    # spread of one band level: K averages over the band's bins
+    # the standard deviation of a band level with K averages over the band's bins
     bins = max(4.0, e.size / max(levels.size, 1) / max(averages, 1))
     spread = 0.5 * 1.25 / np.sqrt(averages / 1.8 * max(bins / 3, 1))
     same = order[order <= quiet[0] * (1 + 5 * spread)]
@@ -130,20 +131,21 @@ def _level_of(e: Array, rate_hz: float) -> tuple[float, float, bool]:
 
 
 HIGH_PASS = 20
-"""Running means over this share of a record are taken off differences between periods: what warms up is no noise."""
+"""Length of the differences between periods over the width of the running mean that is subtracted from them, because
+warm-up is not noise."""
 
 
 SLOW = 1.5
-"""Factor by which the variance of differences grows with a high-pass of three times the width, from which they are
-slow: a walk (three times), or noise that the high-pass cuts. What it lets through says nothing then."""
+"""Growth of the variance of differences with a high-pass of three times the width above which they are slow: a walk
+(three times), or noise that the high-pass removes. The estimate is then invalid."""
 
 
 def repeat_floor(y: Array, inputs: Array) -> tuple[float, float, bool] | None:
-    """Noise from periods of the excitation: (rms, standard error, is it too slow to tell); None when nothing repeats.
+    """Estimate the noise from periods of the excitation: (rms, standard error, True if too slow); None without periods.
 
-    ``y`` (n,) an output, or the residual of a simulation (then what an input does differently in each period is taken
-    off as well); ``inputs`` (n, k). The first of three and more periods is left out: it starts from another state. Slow
-    drift is taken off the differences, and so are lines and bursts.
+    ``y`` (n,) is an output, or the residual of a simulation (which also removes the differences of inputs between
+    periods); ``inputs`` (n, k). The first of three and more periods is left out, because it starts from another state.
+    Slow drift, lines and bursts are removed from the differences.
     """
     n = y.size
     if inputs.size == 0 or n < 200:
@@ -169,7 +171,7 @@ def _repeats(x: Array, lag: int) -> bool:
 
 
 def _variance_without_lines(d: Array, window: int) -> float:
-    """Variance of ``d`` (n,) less its running mean over ``window`` samples, without lines and bursts."""
+    """Return the variance of ``d`` (n,) less its running mean over ``window`` samples, without lines and bursts."""
     d = clip_spikes(d - uniform_filter1d(d, min(window, d.size), mode="nearest"))
     segment = int(min(d.size, max(128, 1 << int(np.log2(max(d.size // 8, 128))))))
     frequency, density = welch(d, 1.0, nperseg=segment, detrend="constant")
@@ -177,13 +179,14 @@ def _variance_without_lines(d: Array, window: int) -> float:
     return float(np.sum(np.where(density > 6.0 * usual, usual, density)[1:])) * float(frequency[1])
 
 
-REST = 1e-3  # of an input's range: an input that moves by less over a stretch rests
-LEAST_REST = 64  # samples of a stretch at rest, whose first half is left to settle
+REST = 1e-3  # largest movement, relative to an input's range, of an input at rest
+LEAST_REST = 64  # least samples of a stretch at rest, whose first half is left for settling
 
 
 def rest_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
-    """Noise of ``y`` (n,) where every input (n, k) rests and the output has settled: (rms, standard error); None when
-    no stretch is long enough or none is settled.
+    """Estimate the noise of ``y`` (n,) where every input (n, k) rests and the output has settled.
+
+    Returns (rms, standard error), or None if no stretch is long enough and settled.
     """
     n = y.size
     if inputs.size == 0 or n < LEAST_REST:
@@ -220,11 +223,11 @@ def noise_floor(
     whole: Array | None = None,
     resolution: float = 0.0,
 ) -> NoiseFloor:
-    """Noise floor of one output.
+    """Estimate the noise floor of an output.
 
-    ``y`` (n,) as recorded, ``residual`` (m,) after the base parameters were fitted, ``inputs`` (n, k), ``whole`` (n,)
-    the residual of one run through the whole record. A declared figure wins; otherwise periods, otherwise stretches at
-    rest, otherwise the quiet end of the spectrum; never below the quantisation.
+    ``y`` (n,) as recorded, ``residual`` (m,) after the fit of the base parameters, ``inputs`` (n, k), ``whole`` (n,)
+    the residual of one run through the whole record. A declared figure has priority, then periods, then stretches at
+    rest, then the quiet end of the spectrum; the floor is never below the quantisation.
     """
     step = max(lattice_step(y), resolution)
     white, error, falling = spectral_floor(residual, rate_hz)
@@ -243,7 +246,7 @@ def noise_floor(
             value = max(value, least)
             return NoiseFloor(value, spread, min(white, value), step, "repeats", falling, value + 2 * spread)
         if repeated is not None and repeated[0] > 0 and not repeated[2]:
-            # what is fast is the instrument's own; what is slow may be a walk, and is left to be found
+            # the fast part is the instrument's own; the slow part may be a walk, which the search may find
             most = max(repeated[0] + 2 * repeated[1], rms)
             return NoiseFloor(max(repeated[0], least), repeated[1], rms, step, "repeats", falling, most)
         if rest is not None:
@@ -254,14 +257,14 @@ def noise_floor(
 
 
 KNOWN_WITHIN = 1.25
-"""Factor within which a floor from periods, rest or a flat spectrum is taken as known, either way."""
+"""Factor, either way, within which a floor from periods, rest or a flat spectrum counts as known."""
 
 
 def floor_interval(floor: NoiseFloor, left: Array, follows: float, rate_hz: float) -> tuple[float, float]:
-    """The interval that the noise rms lies in.
+    """Return the interval of the noise rms.
 
-    ``left`` (m,) what the final model leaves, ``follows`` the share of its variance that goes with recorded signals:
-    the rest is the loudest that the noise can be.
+    ``left`` (m,) is the residual of the final model, ``follows`` the share of its variance that recorded signals
+    predict; the rest is the upper bound of the noise.
     """
     if floor.declared:
         return floor.rms, floor.rms

@@ -1,7 +1,7 @@
-"""A load that only ever moved one way: its dry friction is a constant force, and shows as an offset.
+"""Recognises a load that moved in one direction only: its dry friction is a constant force, equivalent to an offset.
 
-Nothing in such a record tells friction from an offset of the force, so the report says how large the offset is and
-which reversal would tell.
+Such a record cannot distinguish friction from an offset of the force, so the report states the offset and the reversal
+that would distinguish them.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from tools.mismatch.engine.report import Array, BaseShift, OneWay, ParameterValu
 
 BLOCKS = 200
 BACKWARDS = 0.01
-"""Share of the travel that may run backwards (noise, ringing) in a record of one direction."""
+"""Largest share of the travel that may run backwards (noise, ringing) in a record of one direction."""
 MOST = 0.8
-"""Share of the motion between blocks that must stand out of the noise before its direction counts."""
+"""Least share of the motion between blocks that must exceed the noise before its direction counts."""
 REVERSAL = 0.1
-"""Share of the travel that a reversal should have, to be seen clear of play and bristles."""
+"""Least reversal, as a share of the travel, that is visible beside play and bristles."""
 
 
 def direction(y: Array, noise_rms: float, *, is_rate: bool) -> int:
-    """1 or -1 when ``y`` (n,), a position or its rate, only ever moved that way; 0 when it turned, or stood still.
+    """Return 1 or -1 if ``y`` (n,), a position or its rate, moved in that direction only; 0 if it turned or rested.
 
-    Means over blocks are compared, four standard errors of the noise apart: over the shortest blocks between which most
-    of the motion stands out.
+    Means over blocks are compared, four standard errors of the noise apart, over the shortest blocks between which most
+    of the motion exceeds the noise.
     """
     blocks = int(np.clip(y.size // 20, 4, BLOCKS))
     while blocks >= 4:
@@ -45,9 +45,10 @@ def direction(y: Array, noise_rms: float, *, is_rate: bool) -> int:
 
 
 def one_way(problem: Problem, fitted: Fit, shifts: list[BaseShift]) -> OneWay | None:
-    """What a mechanical twin's record of one direction leaves open; None where it turned, or friction has no place.
+    """Return the open question of a mechanical twin's record of one direction.
 
-    ``shifts``: the base parameters as given and re-fitted; the offset is read off them where the twin has one.
+    Returns None if the load turned, or if friction has no place. ``shifts``: the base parameters as given and
+    re-fitted, which contain the offset if the twin has one.
     """
     twin = problem.twin
     o = twin.feedback_on
@@ -64,7 +65,7 @@ def one_way(problem: Problem, fitted: Fit, shifts: list[BaseShift]) -> OneWay | 
 
 
 def _offset(problem: Problem, shifts: list[BaseShift]) -> ParameterValue | None:
-    """Return how far the re-fitted offset of the force is from the one given, in the unit of the force."""
+    """Return the re-fitted offset of the force less the given one, in the unit of the force."""
     by_name = {b.name: b for b in shifts}
     if "offset_per_mass" not in by_name or "inverse_mass" not in by_name:
         return None

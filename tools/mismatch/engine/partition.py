@@ -1,8 +1,8 @@
-"""Where in a chain of two filters a curve sits: a linear twin is split so that effects can stand inside it.
+"""Splits a linear twin into two filters so that effects such as a curve can stand between them.
 
 By Bussgang's theorem the best linear twin of a Wiener-Hammerstein circuit has the poles and zeros of both of its
-filters; which belong to the first one is found by trying (J. Sjoberg, J. Schoukens, Automatica 48 (2012) 353). For each
-split the input of the second filter is known, and a curve there is linear in its heights.
+filters; their assignment to the first one is found by trial (J. Sjoberg, J. Schoukens, Automatica 48 (2012) 353). For
+each split the input of the second filter is known, and a curve there is linear in its heights.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from tools.mismatch.twins.linear import Hold, between_samples, discretise, run_o
 from tools.mismatch.twins.make import make
 
 MOST_ORDER = 8
-"""Poles of a twin that is split at most."""
+"""Largest number of poles of a twin that is split."""
 MOST_SPLITS = 800
 SAMPLES = 8000
-"""Samples that a split is judged on."""
+"""Number of samples on which a split is judged."""
 SKIPPED = 0.03
-"""Share of these at the start that the filters' own start is left to decay in."""
+"""Share of these samples that is skipped at the start, where the filters' start states decay."""
 KNOTS = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)
 """Quantiles of the signal at which the tried curve may bend."""
 NEARLY_REAL = 0.9
-"""Damping ratio from which a pair of poles may stand for two real ones, one in each filter."""
+"""Damping ratio above which a pair of poles may represent two real ones, one in each filter."""
 LOUD = 4.0
-"""Noise variances that a linear twin must leave for a split to be looked for."""
+"""Least residual of a linear twin, in noise variances, for which a split is sought."""
 ROUNDING = 1e-9
-"""Coefficients of a numerator that are smaller than this, relative to the largest, are rounding."""
+"""Relative size below which coefficients of a numerator are rounding."""
 BETTER = 0.5
-"""Share of the mean square that a curve inside may leave of what one at either end leaves."""
+"""Largest mean square with a curve inside, as a share of that with a curve at either end."""
 
 
 @dataclass(frozen=True)
 class Filter:
-    """Zeros, poles and gain of one filter."""
+    """Holds zeros, poles and gain of a filter."""
 
     zeros: tuple[complex, ...]
     poles: tuple[complex, ...]
     gain: float
 
     def matrices(self, hold: Hold) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D. Time runs in units of the fastest pole inside: powers of a rate in rad/s overflow."""
+        """Return A, B, C, D. Time is in units of the fastest pole, because powers of a rate in rad/s overflow."""
         rate = 1.0 if hold == "discrete" else max((abs(p) for p in self.poles), default=0.0) or 1.0
         zeros, poles = ([q / rate for q in roots] for roots in (self.zeros, self.poles))
         found = zpk2ss(zeros, poles, self.gain * rate ** (len(zeros) - len(poles)))
@@ -60,7 +60,7 @@ class Filter:
         return rate * a, rate * b, c, d
 
     def run(self, u: Array, dt: float, hold: Hold) -> Array:
-        """The response (n,) from rest to u (n,)."""
+        """Return the response (n,) from rest to u (n,)."""
         a, b, c, d = self.matrices(hold)
         direct = float(d[0, 0]) * u
         if not self.poles:
@@ -72,7 +72,7 @@ class Filter:
 
 
 def splittable(recording: Recording) -> bool:
-    """Return whether the twin of a recording is one linear filter that may be written as two."""
+    """Return True if the twin of a recording is one linear filter that may be written as two."""
     twin = recording.twin
     if twin.kind != "state_space" or twin.effects or recording.segments or {"first", "states"} & set(twin.parameters):
         return False
@@ -81,9 +81,10 @@ def splittable(recording: Recording) -> bool:
 
 
 def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
-    """The recording with its twin written as two filters, where a curve between them explains far more than one at
-    either end of the chain; else None. ``raw``: the twin as given; a re-fitted one may have bent itself around a curve
-    at one of its ends.
+    """Return the recording with its twin written as two filters, or None.
+
+    A curve between the filters must explain far more than one at either end of the chain. ``raw`` is the twin as given;
+    a re-fitted one may compensate a curve at one of its ends.
     """
     twin, rec = problem.twin, problem.recording
     if not isinstance(twin, DynamicTwin) or not splittable(rec) or twin.restart or not base.ok:
@@ -126,7 +127,7 @@ def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
 
 
 def _filter_of(twin: DynamicTwin, theta: Array) -> Filter:
-    """The transfer function of a twin of one input and one output."""
+    """Return the transfer function of a twin of one input and one output."""
     plant = twin.plant_of(theta)
     c, d = np.zeros((1, plant.a.shape[0])), np.zeros((1, 1))
     for link in twin.links:
@@ -138,7 +139,7 @@ def _filter_of(twin: DynamicTwin, theta: Array) -> Filter:
     poles = np.linalg.eigvals(plant.a)
     size = max(float(np.max(np.abs(poles), initial=0.0)), 1e-300)
     numerator = np.real(np.poly(plant.a - plant.b[:, None] @ c) + (d[0, 0] - 1.0) * np.poly(plant.a))
-    # powers of a typical rate make coefficients of one size; what is left of rounding is no zero far out
+    # powers of a typical rate scale the coefficients to one size; rounding errors are not zeros far away
     scaled = np.abs(numerator) * size ** -np.arange(numerator.size, dtype=np.float64)
     leading = int(np.argmax(scaled > ROUNDING * scaled.max()))
     zeros = np.roots(numerator[leading:])
@@ -146,14 +147,14 @@ def _filter_of(twin: DynamicTwin, theta: Array) -> Filter:
 
 
 def _units(roots: Sequence[complex]) -> list[tuple[complex, ...]]:
-    """Roots that only go together: conjugate pairs, and real ones alone."""
+    """Group roots that belong together: conjugate pairs, and single real ones."""
     size = max((abs(r) for r in roots), default=1.0)
     pairs = [(r, r.conjugate()) for r in roots if r.imag > 1e-9 * size]
     return [*pairs, *((complex(r.real),) for r in roots if abs(r.imag) <= 1e-9 * size)]
 
 
 def _pole_units(roots: Sequence[complex], hold: Hold, dt: float) -> list[tuple[complex, ...]]:
-    """The same for poles, with pairs that hardly swing as two real ones of their size."""
+    """Group poles as ``_units`` does, with strongly damped pairs as two real poles of their size."""
     out: list[tuple[complex, ...]] = []
     for unit in _units(roots):
         p = unit[0]
@@ -168,18 +169,18 @@ def _pole_units(roots: Sequence[complex], hold: Hold, dt: float) -> list[tuple[c
 
 
 def _splits(whole: Filter, hold: Hold, dt: float) -> Iterator[tuple[Filter, Filter]]:
-    """Every way to share poles and zeros out among two proper filters; the first has a gain of one at rest."""
+    """Yield every distribution of poles and zeros among two proper filters; the first has a gain of one at rest."""
     poles, zeros = _pole_units(whole.poles, hold, dt), _units(whole.zeros)
     rest = 1.0 if hold == "discrete" else 0.0
     seen: set[tuple[object, ...]] = set()
-    for mine in itertools.product((True, False), repeat=len(poles)):
-        first_poles = tuple(p for unit, here in zip(poles, mine, strict=True) if here for p in unit)
-        second_poles = tuple(p for unit, here in zip(poles, mine, strict=True) if not here for p in unit)
+    for in_first in itertools.product((True, False), repeat=len(poles)):
+        first_poles = tuple(p for unit, here in zip(poles, in_first, strict=True) if here for p in unit)
+        second_poles = tuple(p for unit, here in zip(poles, in_first, strict=True) if not here for p in unit)
         if not first_poles or not second_poles:
             continue
-        for his in itertools.product((True, False), repeat=len(zeros)):
-            first_zeros = tuple(z for unit, here in zip(zeros, his, strict=True) if here for z in unit)
-            second_zeros = tuple(z for unit, here in zip(zeros, his, strict=True) if not here for z in unit)
+        for zeros_in_first in itertools.product((True, False), repeat=len(zeros)):
+            first_zeros = tuple(z for unit, here in zip(zeros, zeros_in_first, strict=True) if here for z in unit)
+            second_zeros = tuple(z for unit, here in zip(zeros, zeros_in_first, strict=True) if not here for z in unit)
             if len(first_zeros) > len(first_poles) or len(second_zeros) > len(second_poles):
                 continue
             key = (first_poles, first_zeros)
@@ -190,13 +191,13 @@ def _splits(whole: Filter, hold: Hold, dt: float) -> Iterator[tuple[Filter, Filt
             if not np.isfinite(at_rest) or abs(at_rest) < 1e-9:
                 continue
             all_poles = (*first_poles, *second_poles)
-            # poles that were moved apart keep the gain at rest
+            # separated poles keep the gain at rest
             gain = whole.gain * _value(whole.zeros, whole.poles, rest) / _value(whole.zeros, all_poles, rest)
             yield Filter(first_zeros, first_poles, 1.0 / at_rest), Filter(second_zeros, second_poles, gain * at_rest)
 
 
 def _value(zeros: Sequence[complex], poles: Sequence[complex], at: float) -> float:
-    """The value of a transfer function of gain one at a real point."""
+    """Return the value of a transfer function of gain one at a real point."""
     return float(np.real(np.prod([at - z for z in zeros]) / np.prod([at - p for p in poles])))
 
 
@@ -204,7 +205,7 @@ def _left(
     u: Array, y: Array, first: Filter, second: Filter, dt: float, hold: Hold, used: NDArray[np.int64],
     judged: NDArray[np.int64],
 ) -> float:  # fmt: skip
-    """Mean square on the ``judged`` samples that a curve between two filters leaves, fitted on those ``used``."""
+    """Return the mean square on the ``judged`` samples with a curve between two filters, fitted on those ``used``."""
     with np.errstate(all="ignore"):
         x = first.run(u, dt, hold)
         if not np.all(np.isfinite(x)) or np.ptp(x) == 0.0:

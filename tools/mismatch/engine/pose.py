@@ -1,4 +1,4 @@
-"""A recording made ready for a search; and after it, the fits once more in one run through the whole record."""
+"""Prepares a recording for a search; after it, repeats the fits in one run through the whole record."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
-from tools.mismatch.engine.hold import holdable, infer_hold, said_hold, with_hold
+from tools.mismatch.engine.hold import declared_hold, holdable, infer_hold, with_hold
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.many import levelled, repeated_noise
 from tools.mismatch.engine.noise import noise_floor
@@ -38,13 +38,13 @@ from tools.mismatch.twins.ode import OdeTwin, inside_of
 Progress = Callable[[str, int, int], None]
 
 UNKNOWN_START = 0.03
-"""Share of a record at its start that is simulated and not judged: what was before it is still in the memory of stacks,
-filters and masses, and no simulation knows it."""
-LEAST_PART = 30  # samples of a part that can be fitted or scored
+"""Share of a record at its start that is simulated and not scored. The unknown past before the record is still in the
+memory of stacks, filters and masses there."""
+LEAST_PART = 30  # least number of samples of a part that can be fitted or scored
 
 
 def make_split(recording: Recording, held_out: float, seed: int, restart: bool) -> Split:
-    """The recording's own split when it brings one, else ours: few segments for a twin that starts each afresh."""
+    """Return the recording's own split if it has one, else ours, with few segments for a twin that restarts in each."""
     given = ranges_of(recording)
     if given is not None:
         return given_split(recording.n, *given, initialization=recording.split.initialization or 0)
@@ -57,13 +57,13 @@ def make_split(recording: Recording, held_out: float, seed: int, restart: bool) 
 
 
 LEAST_MOVED = 0.06
-"""Share of an input's movement that may be lost with the start of a record."""
+"""Largest share of an input's movement that may be lost with the start of a record."""
 
 
 def before_the_blow(recording: Recording, begin: int) -> int:
-    """The last sample up to ``begin`` before which the inputs hardly moved.
+    """Return the last sample up to ``begin`` before which the inputs hardly moved.
 
-    A record whose excitation is at its start (a hammer blow, one step) would lose all that it shows.
+    A record whose excitation is at its start (a hammer blow, one step) would otherwise lose its information.
     """
     for x in recording.inputs.values():
         moved = np.cumsum(np.diff(x, prepend=x[0]) ** 2)
@@ -73,7 +73,7 @@ def before_the_blow(recording: Recording, begin: int) -> int:
 
 
 def ranges_of(recording: Recording) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Fit and test range that the recording brings; for one alone, the longer rest is the other. None: own split."""
+    """Return the recording's fit and test range; if it has only one, the longer rest is the other. None: own split."""
     fit, test, n = recording.split.fit, recording.split.test, recording.n
     given = next((r for r in (test, fit) if isinstance(r, tuple)), None)
     if given is None:
@@ -85,12 +85,12 @@ def ranges_of(recording: Recording) -> tuple[tuple[int, int], tuple[int, int]] |
 
 
 def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
-    """How our own split simulates: one run through the whole record where the inputs keep it on course, else afresh
-    at every range; and how many measured samples set a start state.
+    """Choose how our own split simulates, and return the number of measured samples that set a start state.
 
-    Only a plant that truly integrates is started afresh: a spring or drag forgets its start within the record.
+    It is one run through the whole record if the inputs determine its course, else a restart at every range. Only a
+    plant that integrates is restarted: with a spring or drag the start state decays within the record.
     """
-    fastest_per_s = getattr(twin, "fastest_per_s", None)  # a corrected axis has it, too
+    fastest_per_s = getattr(twin, "fastest_per_s", None)  # a corrected axis has this attribute, too
     if fastest_per_s is None:
         return twin, 0
     if twin.restart and any(p.name == "stiffness_per_mass" for p in twin.parameters):
@@ -103,13 +103,13 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
 
 
 def restarting(twin: Twin, restart: bool) -> Twin:
-    """A dynamic twin, plain or corrected, that starts every range afresh or does not."""
+    """Return a dynamic twin, plain or corrected, that restarts at every range or does not."""
     assert isinstance(twin, DynamicTwin | CorrectedTwin | OdeTwin | CascadeTwin)
     return replace(twin, restart=restart)
 
 
 def set_floors(problem: Problem, base: Fit) -> Problem:
-    """Noise floors from the recalibrated residual."""
+    """Return the noise floors from the recalibrated residual."""
     rec = problem.recording
     inputs = np.column_stack([*rec.inputs.values()]) if rec.inputs else np.empty((rec.n, 0))
     whole: dict[str, np.ndarray] = {}
@@ -134,7 +134,7 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
 
 @dataclass(frozen=True)
 class Posed:
-    """A recording ready for a search: ``raw`` is the twin as given, ``base`` the twin with its parameters re-fitted."""
+    """Holds a recording ready for a search: ``raw`` is the twin as given, ``base`` that with re-fitted parameters."""
 
     recording: Recording
     effects: tuple[Effect, ...]
@@ -155,7 +155,7 @@ def pose(
 ) -> Posed:
     """Prepare everything that comes before the search: runs joined, circuits opened, hold of the inputs, noise.
 
-    ``look`` says what a part of a very long recording shows.
+    ``look`` searches a part of a very long recording.
     """
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
@@ -164,7 +164,7 @@ def pose(
         problem, _, base = prepared(recording, held_out, seed, False)
         recording = levelled(problem, base)
     hints: tuple[Hint, ...] = ()
-    # an effect that is too weak for one recording is too weak for an excerpt
+    # an effect that is too weak for one recording is also too weak for an excerpt
     long = recording.n > VERY_LONG if recording.parts else is_long(recording, make(recording))
     if long:
         catalogue, hints = nominated(recording, held_out, seed, catalogue, look)
@@ -175,16 +175,18 @@ def pose(
         if hold.kind != "linear":
             recording = with_hold(recording, hold.kind)
             problem, raw, base = prepared(recording, held_out, seed, was_joined)
-    elif said_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
-        said = said_hold(recording)
-        hold = Hold("zero" if said == "zero" else "smooth" if said == "smooth" else "linear", "declared")
+    elif declared_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
+        declared = declared_hold(recording)
+        hold = Hold("zero" if declared == "zero" else "smooth" if declared == "smooth" else "linear", "declared")
     return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, hold)
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A search whose fits run through the whole record. ``official``: the held-out part in one free run, where the
-    decisions were made on shorter stretches."""
+    """Holds a search whose fits run through the whole record.
+
+    ``official`` has the held-out part in one free run if the decisions were made on shorter stretches.
+    """
 
     base: Fit
     fitted: Fit
@@ -192,8 +194,7 @@ class Ended:
 
 
 def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> Ended:
-    """The fits as they are written down: the exported twin runs through, and what adds up over a whole run is fitted
-    in one."""
+    """Repeat the fits for the export: the exported twin runs through, and cumulative effects are fitted in one run."""
     problem, twin = posed.problem, posed.problem.twin
     if not twin.restart or problem.settle:
         return Ended(base, fitted)
@@ -205,9 +206,9 @@ def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> 
 
 
 def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Recording:
-    """The recording with its twin as two filters, where an effect sits between them (``partition``).
+    """Return the recording with its twin as two filters if an effect sits between them (``partition``).
 
-    The busiest stretch decides; a twin that cannot be split costs nothing.
+    The busiest stretch decides; a twin that cannot be split costs no time.
     """
     if not splittable(recording):
         return recording
@@ -217,10 +218,10 @@ def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Record
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
-    """The model with its parameters fitted once more in the one free run of ``official``, when that helps there.
+    """Fit the parameters once more in the single free run of ``official``, if that improves it there.
 
-    Short stretches show which physics is missing; what only adds up over the whole run (an offset of the force under an
-    integrator) they leave loose.
+    Short stretches show which physics is missing, but do not determine parameters whose influence accumulates over the
+    whole run (an offset of the force under an integrator).
     """
     through = Model(official.twin, fitted.model.placed)
     start = residuals(official, through, fitted.theta)
@@ -235,7 +236,7 @@ def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
 
 
 def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool) -> tuple[Problem, Fit, Fit]:
-    """The problem with its noise floors, the twin as given and recalibrated."""
+    """Return the problem with its noise floors, the twin as given, and the recalibrated twin."""
     twin = make(recording)
     init = recording.split.initialization or 0
     parts = [(p.start, p.stop) for p in recording.parts]
@@ -250,20 +251,20 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     else:
         split = make_split(recording, held_out, seed, drifts)
     if not own and not parts and dynamic and not drifts and (was_joined or starts_anew(recording, twin, split, init)):
-        # the second recording has a start of its own
+        # the second recording has its own start
         twin = restarting(twin, True)
     if not own and not parts and twin.restart:
         init = max(init, 20) if drifts or not init else init
     if not own and not parts and drifts:
         split = shot(split, init)
     else:
-        # of a short record something must be left to score
+        # a short record must keep samples to score
         init = min(init, min(b - a for a, b in split.held_out) // 3)
     # the first samples show a start state with their noise, and inside a play not at all; of an axis they have to
     afresh = own and drifts and inside_of(twin) is not None
     problem = Problem(recording, twin, split, init, seed, afresh=afresh)
     settle = dynamic and not drifts
-    # the engineer's start state is that of one run
+    # the engineer's start state is that of a single run
     raw = as_given(replace(problem, settle=settle and (twin.restart or "x0" not in recording.twin.parameters)))
     problem = replace(problem, settle=settle)
     rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
@@ -275,8 +276,9 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
 
 
 def split_recordings(recording: Recording, twin: Twin, held_out: float, seed: int) -> tuple[Twin, int, Split]:
-    """The twin that starts afresh in every recording of several, how many samples set its start, and the split that
-    holds whole recordings out.
+    """Return the twin that restarts in every recording of several, and the split that holds whole recordings out.
+
+    The number of samples that set its start is returned as well.
     """
     parts = [(p.start, p.stop) for p in recording.parts]
     init, skip = 0, UNKNOWN_START
@@ -308,11 +310,11 @@ def starts_anew(recording: Recording, twin: Twin, split: Split, init: int) -> bo
 
 
 ANEW = 3.0
-"""Residual at the start of a test part over that of the fitted part: beyond it the test is a run of its own."""
+"""Residual at the start of a test part, relative to that of the fitted part, above which the test is a separate run."""
 
 
 def preferred(problem: Problem, base: Fit) -> Fit:
-    """The re-fitted base, or the engineer's own values where the re-fit does worse on held-out samples."""
+    """Return the re-fitted base, or the engineer's own values if the re-fit is worse on held-out samples."""
     given = as_given(problem)
     if not given.ok or not stayed(problem, given.residual):
         return base
@@ -320,14 +322,15 @@ def preferred(problem: Problem, base: Fit) -> Fit:
 
 
 Look = Callable[[Problem, Fit, tuple[Effect, ...]], tuple[set[str], list[Hint]]]
-"""Describes what a search on a part of a recording finds: names that may matter, and what the best were found to be."""
+"""Searches a part of a recording; returns the names that may matter, and the fits of the best as hints."""
 
 
 def nominated(
     recording: Recording, held_out: float, seed: int, catalogue: tuple[Effect, ...], look: Look
 ) -> tuple[tuple[Effect, ...], tuple[Hint, ...]]:
-    """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals, and
-    what the excerpt found them to be.
+    """Return the effects that an excerpt at full rate or a thinned copy of a long record accepts, and hints.
+
+    The effects include close rivals; the hints are the fits on the excerpt.
     """
     recording = fitted_part(recording)
     if recording.n < 2 * part_of(recording):
@@ -336,28 +339,27 @@ def nominated(
     hints: list[Hint] = []
     parts = [(excerpt(recording, part_of(recording)), catalogue)]
     if getattr(make(recording), "hold", "") == "discrete":
-        # its difference equation holds at its own rate alone
+        # a difference equation is valid at its own rate only
         names |= set(OVER_ALL)
     else:
         slow = tuple(e for e in catalogue if e.name in SLOW)
         parts.append((thinned_copy(recording, part_of(recording)), slow))
     for part, allowed in parts:
         problem, _, base = prepared(part, held_out, seed, False)
-        found, shown = look(problem, base, allowed)
+        found, new_hints = look(problem, base, allowed)
         names |= found
         if part is parts[0][0]:
-            hints = shown
+            hints = new_hints
     return tuple(e for e in catalogue if e.name in names), tuple(hints)
 
 
 def may_hint(placed: Placed, candidate: Candidate) -> bool:
-    """Return True if what a part shows of an effect says where to begin on the whole: not what is about instants or the
-    lattice of samples."""
+    """Return True if the fit of an effect on a part is a start for the whole: not for instants or sample lattices."""
     return not candidate.tested and placed.effect.driven
 
 
 def hint_of(placed: Placed, fitted: Fit) -> Hint:
-    """Return what the fit on a part found an effect of it to be."""
+    """Return the fit of an effect on a part as a hint."""
     model, theta = fitted.model, fitted.theta
     nonlinear, weights = model.slices(model.placed.index(placed))
     return Hint(placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))

@@ -1,4 +1,4 @@
-"""One recording under diagnosis: twin, split, views and the noise that residuals are measured against."""
+"""Represents a recording under diagnosis: twin, split, views and the noise that scales residuals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Hint:
-    """What a part of the recording found an effect at a place to be: parameters of the ``base`` and ``own`` ones."""
+    """Holds the fit of an effect at a place on a part of the recording: parameters of the ``base`` and ``own`` ones."""
 
     placed: Placed
     base: Array
@@ -32,11 +32,13 @@ class Hint:
 
 @dataclass(frozen=True)
 class Problem:
-    """What every step of a diagnosis shares. ``view`` covers fit and held-out samples, ``fit_view`` the fit alone:
-    only the latter is shown to whatever chooses settings, starting points or parameters. ``settle``: the start state of
-    a linear run is fitted to all samples of the fit, like any parameter; otherwise it is the engineer's, or the first
-    samples set it. ``afresh``: the start states of every stretch, held-out ones too, are fitted to all its samples.
-    ``hints``: from a part of the recording, to begin from beside what the whole suggests.
+    """Holds the data that all steps of a diagnosis share.
+
+    ``view`` covers fit and held-out samples, ``fit_view`` the fit alone: only the latter is used to choose settings,
+    starting points or parameters. ``settle``: the start state of a linear run is fitted to all samples of the fit, as a
+    parameter; otherwise it is the engineer's, or the first samples set it. ``afresh``: the start states of every
+    stretch, held-out ones too, are fitted to all its samples. ``hints`` are starts from a part of the recording, in
+    addition to those that the whole suggests.
     """
 
     recording: Recording
@@ -50,7 +52,7 @@ class Problem:
     hints: tuple[Hint, ...] = ()
 
     def __getstate__(self) -> dict[str, object]:
-        """Fields alone: what is derived (and what views remember) is rebuilt in a worker process."""
+        """Return the fields alone: derived values (and the caches of views) are rebuilt in a worker process."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def __setstate__(self, state: dict[str, object]) -> None:
@@ -72,7 +74,7 @@ class Problem:
 
     @cached_property
     def fit_rows(self) -> NDArray[np.int64]:
-        """Rows of the view that may be fitted."""
+        """Return the rows of the view that may be fitted."""
         mask = self.split.fit_mask()[self.index] & self.view.scored(self.twin)
         return np.nonzero(mask)[0]
 
@@ -83,13 +85,13 @@ class Problem:
 
     @cached_property
     def row_of_sample(self) -> NDArray[np.int64]:
-        """Row of each sample of the recording (-1: not in the view)."""
+        """Return the row of each sample of the recording (-1: not in the view)."""
         row = np.full(self.recording.n, -1)
         row[self.index] = np.arange(self.index.size)
         return row
 
     def rows(self, spans: tuple[Span, ...]) -> list[Span]:
-        """Spans of samples as spans of rows of the view; spans that fall outside are left out."""
+        """Return spans of samples as spans of rows of the view; spans that fall outside are left out."""
         out: list[Span] = []
         scored = self.view.scored(self.twin)
         for a, b in spans:
@@ -118,7 +120,7 @@ class Problem:
 
     @cached_property
     def lively(self) -> NDArray[np.bool_]:
-        """Rows of the view shortly after a jump of an input: what is far out there is a response and no outlier."""
+        """Return a mask of the rows shortly after a jump of an input, where a large value is a response, no outlier."""
         return after_jumps(self.recording.inputs.values(), self.recording.n)[self.index]
 
     @cached_property
@@ -127,8 +129,9 @@ class Problem:
 
     @cached_property
     def opening(self) -> Problem | None:
-        """The same problem on the first part of a long recording, when that shows most of the range and rates
-        of every input: what runs freely from the first sample is there exactly what it is in the whole.
+        """Return the problem on the first part of a long recording, if that shows most of the inputs' range and rates.
+
+        A free run from the first sample is identical there to that of the whole.
         """
         n = self.recording.n
         signals = [*self.recording.inputs.values()]
@@ -142,7 +145,7 @@ class Problem:
 
     @cached_property
     def given(self) -> Array:
-        """Base parameters as the engineer gave them."""
+        """Return the base parameters as the engineer gave them."""
         return self.twin.start(self.recording)
 
     def sigma(self, output: str) -> float:
@@ -156,11 +159,11 @@ class Problem:
 
 
 LEAST_OPENING = 15_000
-"""Samples of the first part of a recording that a search may be started on."""
+"""Least number of samples of the first part of a recording on which a search may begin."""
 
 
 def _shows(part: Array, whole: Array) -> bool:
-    """Does a part of a signal reach most of its range and move about as fast. A search ends on the whole anyway."""
+    """Return True if a part of a signal reaches most of its range and rate. A search ends on the whole anyway."""
     if float(np.ptp(part)) < 0.8 * float(np.ptp(whole)):
         return False
     some, every = (float(np.quantile(np.abs(np.diff(x)), 0.99)) for x in (part, whole))
@@ -175,8 +178,9 @@ def _first(recording: Recording, samples: int) -> Recording:
 
 
 def spread(rows: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """At most ``most`` of ``rows``, evenly spread but at irregular distances: a regular stride would fold lines of the
-    spectrum onto others.
+    """Select at most ``most`` of ``rows``, evenly spread but at irregular distances.
+
+    A regular stride would alias lines of the spectrum onto others.
     """
     if rows.size <= most:
         return rows
@@ -186,7 +190,7 @@ def spread(rows: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
 
 
 def _with_init(held: tuple[Span, ...], init: int, twin: Twin, split: Split) -> tuple[Span, ...]:
-    """Held-out spans with the samples in front that set the state (their outputs are not scored)."""
+    """Return the held-out spans with the samples in front that set the state (their outputs are not scored)."""
     if init <= 0 or split.own or not twin.restart:
         return held
     return tuple((max(0, a - init), b) for a, b in held)

@@ -1,5 +1,7 @@
-"""Weighted residuals as a function of the nonlinear parameters alone: the linear ones are solved exactly (variable
-projection: Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973), outliers bounded by Huber's weights.
+"""Computes weighted residuals as a function of the nonlinear parameters alone.
+
+Linear parameters are solved exactly (variable projection: Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973), and
+outliers are bounded by Huber's weights.
 """
 
 from __future__ import annotations
@@ -21,17 +23,17 @@ HUBER = 4.0
 
 
 def huber_weights(z: Array) -> Array:
-    """Huber's weights of residuals in units of their robust scale."""
+    """Return Huber's weights of residuals in units of their robust scale."""
     return np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-12))
 
 
 def robust_scale(r: Array, floor: float) -> float:
-    """Scale of a residual that outliers do not own, never below ``floor``."""
+    """Return the robust scale of a residual, never below ``floor``."""
     return max(1.4826 * float(np.median(np.abs(r - np.median(r)))), floor, 1e-300)
 
 
 class Projected:
-    """Residuals as a function of the nonlinear parameters alone."""
+    """Computes residuals as a function of the nonlinear parameters alone."""
 
     def __init__(self, problem: Problem, model: Model, outputs: Sequence[str], most_rows: int) -> None:
         self.problem = problem
@@ -50,7 +52,7 @@ class Projected:
         self.evaluations = 0
 
     def _name_parameters(self) -> None:
-        """The parameters that move ``outputs``: those to be searched, solved and believed."""
+        """Sort the parameters that move ``outputs``: those that are searched, solved, and have a prior."""
         model = self.model
         moving = model.parameters_of(self.outputs)
         self.free = [i for i in model.nonlinear if i in moving]
@@ -64,9 +66,7 @@ class Projected:
         self.believed = np.array(believed, int)
 
     def only(self, outputs: Sequence[str]) -> tuple[Projected, NDArray[np.int64]]:
-        """The same residuals of ``outputs`` alone, which share no linear parameter with the others; and where they are
-        among all.
-        """
+        """Return the residuals of ``outputs`` alone and their places; they share no linear parameter with others."""
         part = copy.copy(self)
         part.outputs = tuple(o for o in self.outputs if o in outputs)
         part._name_parameters()
@@ -76,7 +76,7 @@ class Projected:
 
     @property
     def usual_count(self) -> float:
-        """Return how many squares the cost sums."""
+        """Return the number of squares in the cost."""
         return float(sum(u.sum() for u in self.usual.values()))
 
     def reweight(self, residual: dict[str, Array]) -> None:
@@ -88,13 +88,14 @@ class Projected:
             self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
 
     def _from_belief(self, theta: Array) -> Array:
-        """Residuals of the prior: how far base parameters are from the engineer's own values."""
+        """Return the residuals of the prior: distances of base parameters from the engineer's own values."""
         at = [to_search(self.model.parameters[i], float(theta[i])) for i in self.believed]
         return (np.array(at) - self.centre[self.believed]) / self.width[self.believed]
 
     def evaluate(self, theta: Array) -> tuple[Array, Array]:
-        """Weighted residuals on the rows (all outputs joined, then those of the prior) and theta with its linear part
-        solved.
+        """Return weighted residuals on the rows and theta with its linear part solved.
+
+        All outputs are joined, followed by the residuals of the prior.
         """
         self.evaluations += 1
         theta = theta.copy()
@@ -115,7 +116,7 @@ class Projected:
             gram[np.ix_(at, at)] += a.T @ a
             cross[at] += a.T @ b
             kept.append((a, b, at))
-        # of a plant that ran away: no cost, and LAPACK must not see it
+        # a diverged plant has no finite cost, and LAPACK must not receive its values
         runaway = np.full(sum(b.size for _, b, _ in kept) + self.believed.size, np.inf), theta
         if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross))):
             return runaway
@@ -127,7 +128,7 @@ class Projected:
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled = gram / np.outer(size, size)
         if np.any(self.penalty):
-            # rows are in units of weight; weak against what the data see
+            # rows are in units of weight and weak compared with the data
             rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
             scaled = scaled + (rows.T @ rows) / np.outer(size, size)
         scaled[np.diag_indices(k)] += 1e-11

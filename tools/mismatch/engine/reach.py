@@ -1,4 +1,4 @@
-"""What a twin does not allow to be tried, and how sure a name can be that had no rival inside."""
+"""Describes effects that a kind of twin cannot have, and bounds the probability of names without such rivals."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.opaque import OpaqueTwin
 
 MUCH_LEFT = 3.0
-"""Residual over noise floor above which what was named is not the whole account."""
+"""Ratio of residual to noise floor above which the named effects are not the whole account."""
 NO_RIVAL = 0.5
-"""Most that a name is sure where much is left: the one that explains it all was not tried, or was not found."""
+"""Largest probability of a name beside a large rest: the complete explanation was not tried, or was not found."""
 _INSIDE = "friction, springs, play, flows and limits inside its equations could not be tried"
 
 
 def not_tried(twin: Twin) -> str:
-    """What could not be tried on this kind of twin and which kind would allow it, in a sentence; "" if all could."""
+    """Return a sentence on the effects that this kind of twin cannot have and the kind that can; "" without any."""
     core = getattr(twin, "core", twin)
     if core.kind == "columns":
         return (
@@ -39,18 +39,19 @@ def not_tried(twin: Twin) -> str:
 
 
 def much_left(physics: Sequence[PhysicsFound], floors: Mapping[str, float]) -> bool:
-    """Return whether what the named effects leave is far above the noise: they are not the whole account."""
+    """Return True if the residual of the named effects is far above the noise: they are not the whole account."""
     return any(p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics)
 
 
 def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[str, float]) -> bool:
-    """Return whether the named effects leave much that may sit where this kind of twin lets nothing be tried."""
+    """Return True if the named effects leave a large rest that may sit where this kind of twin allows no effects."""
     return bool(not_tried(twin)) and much_left(physics, floors)
 
 
 def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
-    """For each effect, whether a parameter of the simulation that is off could be what it was taken for: a linear
-    effect behind columns of simulated output, whose parameters nobody can re-fit here.
+    """Return for each effect if a wrong parameter of the simulation can imitate it.
+
+    This holds for a linear effect behind columns of simulated output, whose parameters cannot be re-fitted here.
     """
     columns = getattr(twin, "core", twin).kind == "columns"
     linear = {name for name, effect in EFFECTS.items() if effect.is_linear}
@@ -58,5 +59,5 @@ def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
 
 
 def tempered(physics: Sequence[PhysicsFound]) -> list[PhysicsFound]:
-    """The same effects, none surer than ``NO_RIVAL``: what could explain the rest had no chance against them."""
+    """Return the effects with probabilities of at most ``NO_RIVAL``, since the explanation of the rest was no rival."""
     return [replace(p, confidence=min(p.confidence, NO_RIVAL)) for p in physics]

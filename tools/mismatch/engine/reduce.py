@@ -1,4 +1,4 @@
-"""Long records: effects are nominated on an excerpt and on a thinned copy, and decided on everything."""
+"""Reduces long records: effects are nominated on an excerpt and on a thinned copy, and decided on the whole."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from tools.mismatch.recording import Recording, Split
 from tools.mismatch.twins.base import Twin
 
 LONG = 40_000
-"""Samples (of all outputs, for a twin with modes) above which the search starts on reduced copies."""
+"""Number of samples (of all outputs, for a twin with modes) above which the search starts on reduced copies."""
 PART = 10_000
-"""Samples of a reduced copy of a record that is not longer than ``VERY_LONG``."""
+"""Number of samples of a reduced copy of a record that is not longer than ``VERY_LONG``."""
 VERY_LONG = 200_000
 LONG_PART = 60_000
-"""Samples of a reduced copy of a longer record."""
+"""Number of samples of a reduced copy of a longer record."""
 SLOW = (
     "thermal_drift",
     "temperature_sensitivity",
@@ -30,24 +30,24 @@ SLOW = (
     "hysteresis",
     "static_nonlinearity",
 )
-"""What a thinned copy may nominate: slower than its samples, or grown over the whole record."""
+"""Effects that a thinned copy may nominate: slower than its samples, or accumulated over the whole record."""
 OVER_ALL = ("thermal_drift", "random_walk", "step_shift", "clock_skew", "dropped_samples")
-"""What shows over the whole record only, and is nominated unseen where no thinned copy can be simulated."""
+"""Effects that are visible over the whole record only. All are nominated if no thinned copy can be simulated."""
 
 
 def is_long(recording: Recording, twin: Twin) -> bool:
-    """Return whether a search on the whole record takes minutes."""
+    """Return True if a search on the whole record takes minutes."""
     modes = hasattr(twin, "fastest_per_s")
     return recording.n * (len(recording.outputs) if modes else 1) > LONG
 
 
 def part_of(recording: Recording) -> int:
-    """Samples of its reduced copies."""
+    """Return the number of samples of the reduced copies."""
     return LONG_PART if recording.n > VERY_LONG else PART
 
 
 def fitted_part(recording: Recording) -> Recording:
-    """The part of a recording that its own split says may be fitted, alone; all of it where it brings no split."""
+    """Return the part of a recording that its own split allows to fit; all of it without a split."""
     fit, test = recording.split.fit, recording.split.test
     if isinstance(fit, tuple):
         return _part(recording, slice(*fit), recording.dt)
@@ -58,7 +58,7 @@ def fitted_part(recording: Recording) -> Recording:
 
 
 def excerpt(recording: Recording, samples: int = LONG_PART) -> Recording:
-    """The contiguous stretch in which the inputs are busiest (largest mean square rate), at full rate."""
+    """Return the contiguous stretch with the busiest inputs (largest mean square rate), at full rate."""
     n = recording.n
     if n <= samples:
         return recording
@@ -73,7 +73,7 @@ def excerpt(recording: Recording, samples: int = LONG_PART) -> Recording:
 
 
 def thinned_copy(recording: Recording, samples: int = LONG_PART) -> Recording:
-    """Block means of every channel, so that about ``samples`` are left."""
+    """Return block means of every channel, so that about ``samples`` are left."""
     k = max(1, recording.n // samples)
     if k == 1:
         return recording

@@ -1,4 +1,4 @@
-"""The answer: frozen records that mirror section 5 of the contract, and the arrays that pictures are made of."""
+"""Defines the report: frozen records that mirror section 5 of the contract, and the arrays for pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.jsonable import to_jsonable
 Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
 Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
-"""What an ``unexplained`` means; "" for the other verdicts."""
+"""Meaning of the verdict ``unexplained``; "" for the other verdicts."""
 WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance", "unlikely"]
 
 
@@ -26,7 +26,10 @@ class Window:
 
 @dataclass(frozen=True)
 class DependsOn:
-    """``strength``: share of the residual's variance that follows; ``memory``: history helps beyond the present."""
+    """Describes a dependence of the residual.
+
+    ``strength``: share of the residual's variance that follows; ``memory``: history helps beyond the present.
+    """
 
     signal: str
     feature: str
@@ -53,7 +56,7 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class PhysicsFound:
-    """One accepted effect. ``site``, ``target``, ``outputs``, ``settings`` and ``raw`` are what ``apply`` needs."""
+    """Holds an accepted effect. ``apply`` needs ``site``, ``target``, ``outputs``, ``settings`` and ``raw``."""
 
     name: str
     output: str
@@ -75,9 +78,11 @@ class PhysicsFound:
 
 @dataclass(frozen=True)
 class Withheld:
-    """An effect that lowered the residual and is not named. ``shown_by``: the parameters (of ``parameters``, or
-    searched ones) whose interval holds zero or that ended at a limit of the search. ``residual_rms_without`` and
-    ``_with`` are held out; ``replaced_by``: the plainer effect that is named in its place.
+    """Holds an effect that lowered the residual and is not named.
+
+    ``shown_by``: the parameters (of ``parameters``, or searched ones) whose interval contains zero or that ended at a
+    limit of the search. ``residual_rms_without`` and ``_with`` are held out; ``replaced_by``: the simpler effect that
+    is named in its place.
     """
 
     name: str
@@ -92,9 +97,11 @@ class Withheld:
 
 @dataclass(frozen=True)
 class Hold:
-    """What the inputs do between their samples: ``kind`` zero (held), linear or smooth (nothing above half the sampling
-    rate); ``how``: declared, inferred, assumed (the data do not tell) or instead_of_delay (a named delay of half a
-    sample was the hold). ``share``: 0 is linear, 1 the other that was tried: held, or smooth where that was inferred.
+    """Describes the course of inputs between their samples.
+
+    ``kind`` is zero (held), linear or smooth (nothing above half the sampling rate); ``how`` is declared, inferred,
+    assumed (the data do not determine it) or instead_of_delay (a named delay of half a sample was the hold).
+    ``share``: 0 is linear, 1 the tested alternative: held, or smooth where that was inferred.
     """
 
     kind: Literal["zero", "linear", "smooth"]
@@ -105,8 +112,10 @@ class Hold:
 
 @dataclass(frozen=True)
 class OneWay:
-    """A load that moved one way only (``direction`` 1 or -1): friction shows as ``offset`` of the force (re-fitted less
-    given; None where the twin has no such parameter). ``reversal``: travel, in ``unit``, that would tell.
+    """Describes a load that moved in one ``direction`` only (1 or -1), so that friction acts as an offset.
+
+    ``offset`` of the force is re-fitted less given (None if the twin has no such parameter). ``reversal``: travel, in
+    ``unit``, that would distinguish them.
     """
 
     output: str
@@ -132,7 +141,7 @@ class Equivalent:
 
 @dataclass(frozen=True)
 class BaseShift:
-    """A base parameter as given, re-fitted alone, and re-fitted beside the effects."""
+    """Holds a base parameter as given, re-fitted alone, and re-fitted beside the effects."""
 
     name: str
     unit: str
@@ -144,9 +153,10 @@ class BaseShift:
 
 @dataclass(frozen=True)
 class Sealed:
-    """Rms of the residual per output on the end of the recording, which nothing read before everything was decided.
-    ``span``: its samples, stop excluded; None where nothing was sealed, and ``why``: "short", "own_split" (the
-    recording says what is fitted and tested) or "several_recordings" (each is left out in turn).
+    """Holds the rms of the residual per output on the end of the recording, which is read only after the decision.
+
+    ``span``: its samples, stop excluded; None if nothing was sealed, and then ``why`` is "short", "own_split" (the
+    recording declares the fitted and tested parts) or "several_recordings" (each is left out in turn).
     """
 
     span: tuple[int, int] | None
@@ -171,9 +181,9 @@ class FitSummary:
     noise_floor_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, "tuple[float, float]"])
     tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     file_unit: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Unit of an output in the data file, where it is not ``unit``: people are shown that one."""
+    """Unit of an output in the data file, if it is not ``unit``; reports for people use it."""
     base_human: tuple[BaseShift, ...] = ()
-    """The base parameters under the names and units of the twin's file (mass, not its inverse), for people."""
+    """Base parameters under the names and units of the twin's file (mass, not its inverse), for people."""
     sealed: Sealed | None = None
 
 
@@ -188,7 +198,7 @@ class Checks:
 
 @dataclass(frozen=True)
 class HeldOutRecording:
-    """Rms of the residual per output on recordings that the fit left out: base parameters alone, and with physics."""
+    """Holds the rms of the residual per output on left-out recordings: base parameters alone, and with physics."""
 
     names: tuple[str, ...]
     recalibrated_rms: Mapping[str, float]
@@ -197,8 +207,10 @@ class HeldOutRecording:
 
 @dataclass(frozen=True)
 class BetweenRecordings:
-    """A parameter estimated in each recording, to first order: ``values`` and ``standard_errors`` in the order of
-    ``Together.recordings``. ``free``: it was free in each; otherwise the recordings share one value.
+    """Holds a parameter that was estimated in each recording, to first order.
+
+    ``values`` and ``standard_errors`` are in the order of ``Together.recordings``. ``free``: the parameter was free in
+    each; otherwise the recordings share one value.
     """
 
     name: str
@@ -210,9 +222,11 @@ class BetweenRecordings:
 
 @dataclass(frozen=True)
 class Change:
-    """A parameter that changes with a condition. ``slope`` in the parameter's unit per unit of the condition (None: the
-    condition is a word), ``relative`` the same as a share of the mean; ``p_value`` corrected for all that was tried;
-    ``same`` conditions that go with it as well and that these recordings cannot tell from it.
+    """Describes a parameter that changes with a condition.
+
+    ``slope`` is in the parameter's unit per unit of the condition (None: the condition is a word), ``relative`` the
+    same as a share of the mean; ``p_value`` is corrected for the number of tests; ``same`` are correlated conditions
+    that these recordings cannot distinguish from it.
     """
 
     parameter: str
@@ -225,8 +239,10 @@ class Change:
 
 @dataclass(frozen=True)
 class Together:
-    """Several recordings of one system. ``held_out``: one entry per fold; ``rms_recalibrated`` and ``rms_fitted`` over
-    all folds; ``p_value`` one-sided, that physics does not help on a recording that was left out (None: none named).
+    """Holds the results on several recordings of one system.
+
+    ``held_out``: one entry per fold; ``rms_recalibrated`` and ``rms_fitted`` over all folds; ``p_value``: one-sided,
+    that physics does not help on a left-out recording (None: no effect is named).
     """
 
     recordings: tuple[str, ...]
@@ -242,8 +258,11 @@ class Together:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Arrays for the report: time (m,), inputs and, per output, measured, as given, recalibrated, fitted (m,);
-    ``held_out`` (m,) bool; ``units`` of the signals. Not part of the JSON."""
+    """Holds arrays for the report, which are not part of the JSON.
+
+    They are time (m,), inputs and, per output, measured, as given, recalibrated, fitted (m,); ``held_out`` (m,) bool;
+    ``units`` of the signals.
+    """
 
     t: Array
     held_out: NDArray[np.bool_]
@@ -257,8 +276,10 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Report:
-    """What ``diagnose`` says. ``chain``: the twin's stages in order; ``corrected_parameters``: the base parameters that
-    ``corrected_base`` was written from, in the order of ``fit.base_parameters``.
+    """Holds the result of ``diagnose``.
+
+    ``chain``: the twin's stages in order; ``corrected_parameters``: the base parameters from which ``corrected_base``
+    was written, in the order of ``fit.base_parameters``.
     """
 
     recording: str
@@ -282,23 +303,23 @@ class Report:
     """Effects that were tried and are not named, with the reason."""
     corrected_parameters: tuple[float, ...] = ()
     meaning: Meaning = ""
-    """What the verdict ``unexplained`` means."""
+    """Meaning of the verdict ``unexplained``."""
     trouble: tuple[str, ...] = ()
-    """What went wrong in the fit, in words."""
+    """Failures of the fit, in words."""
     doubtful: tuple[str, ...] = ()
-    """Outputs whose verdict would be another at the lower end of the noise floor's interval."""
+    """Outputs whose verdict would differ at the lower end of the noise floor's interval."""
     hold: Mapping[str, Hold] = field(default_factory=dict[str, Hold])
-    """Per input of a twin with memory: what it does between its samples."""
+    """Course of each input of a twin with memory between its samples."""
     one_way: OneWay | None = None
-    """A load that moved one way only, so that its friction shows as an offset."""
+    """Load that moved in one direction only, so that its friction acts as an offset."""
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
     together: Together | None = None
-    """Several recordings that were diagnosed together: what differs between them."""
+    """Differences between recordings that were diagnosed together."""
     not_tried: str = ""
-    """What this kind of twin does not allow to be tried, and which kind would."""
+    """Sentence on the effects that this kind of twin cannot have, and the kind that can."""
 
     def to_json(self) -> dict[str, Any]:
-        """The JSON of the contract, with optional keys beside; numbers finite or null."""
+        """Return the JSON of the contract, with additional optional keys; numbers are finite or null."""
         body = asdict(Report(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, "pictures": None}))
         body.pop("pictures")
         if self.together is None:

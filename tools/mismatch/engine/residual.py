@@ -1,4 +1,4 @@
-"""Residuals on a problem's view, and what stands in for samples that an effect takes as its own events."""
+"""Computes residuals on a problem's view, and replaces samples that an effect claims as events."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[str] | None = None) -> dict[str, Array]:
-    """Measured minus simulated on the problem's view (of ``outputs``, all if None); not finite becomes very large.
+    """Return measured minus simulated on the problem's view (of ``outputs``, all if None); non-finite becomes large.
 
-    In samples that an effect takes as its own events earlier usual samples stand in, so that every mean square is over
-    usual samples; not the nearest, which is quiet by the choice of where the event ends.
+    Samples that an effect claims as events are replaced by earlier usual samples, so that every mean square is over
+    usual samples. The nearest ones are not used, because the choice of an event's end makes them quiet.
     """
     found = model.residual(problem.view, theta, outputs)
     out: dict[str, Array] = {}
@@ -31,12 +31,14 @@ def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[st
     return out
 
 
-STAND_OFF = 8  # samples between an event and what stands in for it
+STAND_OFF = 8  # number of samples between an event and its replacement
 
 
 def stand_ins(excused: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Row that stands for each row (n,): itself, or for the k-th of an event the k-th usual one before it, from
-    ``STAND_OFF`` back; at the start of the record the first ones after it. At least one row must be usual.
+    """Return the row that replaces each row (n,): usual rows are kept.
+
+    The k-th row of an event is replaced by the k-th usual one before it, from ``STAND_OFF`` back; at the start of the
+    record by the first ones after it. At least one row must be usual.
     """
     usual = np.flatnonzero(~excused)
     source = np.arange(excused.size)

@@ -1,4 +1,4 @@
-"""Is one model better than another on data that neither has seen, and by how much."""
+"""Compares two models on held-out data: which is better, and by how much."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from tools.mismatch.engine.projected import robust_scale
 Array = NDArray[np.float64]
 Span = tuple[int, int]
 
-CLIP = 30.0  # robust scales; the same outlier in two models cancels in their difference
+CLIP = 30.0  # limit in robust scales; the same outlier in two models cancels in their difference
 CLIP_WHITE = 8.0
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A larger model against a smaller one on held-out samples.
+    """Compares a larger model with a smaller one on held-out samples.
 
-    ``z``: whitened correlation of what the larger model changes with what the smaller one leaves, standard normal
-    when nothing is missing (the direction was learned on other data, so there is no optimism in it). The rest is
-    over the outputs that change: ``before`` and ``after`` mean square over noise variance per output;
-    ``effect_rms`` what the larger model changes, per output.
+    ``z``: whitened correlation of the larger model's change with the smaller one's residual, standard normal under the
+    null hypothesis (the direction was learned on other data, so it is unbiased). The rest is over the outputs that
+    change: ``before`` and ``after`` are mean squares over noise variance per output; ``effect_rms`` is the rms of the
+    change per output.
     """
 
     z: float
@@ -36,31 +36,31 @@ class Comparison:
 
     @property
     def gain(self) -> float:
-        """Share of the mean square that goes, on the output where most goes."""
+        """Return the largest removed share of the mean square over the outputs."""
         return max((1 - self.after[o] / max(b, 1e-300) for o, b in self.before.items()), default=0.0)
 
 
 def winsorised(r: Array, floor: float, lively: NDArray[np.bool_] | None = None) -> Array:
-    """Residual with outliers pulled in to thirty robust scales, but for samples that answer a jump of the input."""
+    """Return the residual clipped at thirty robust scales, except for samples that respond to a jump of the input."""
     limit = CLIP * robust_scale(r, floor)
     clipped = np.clip(r, -limit, limit)
     return clipped if lively is None else np.where(lively, r, clipped)
 
 
 def held_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
-    """Rms of the residual per output on held-out samples."""
+    """Return the rms of the residual per output on held-out samples."""
     rows = problem.held_rows
     return {o: float(np.sqrt(np.mean(r[rows] ** 2))) for o, r in fitted.residual.items()}
 
 
 def fit_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
-    """Rms of the residual per output on fitted samples."""
+    """Return the rms of the residual per output on fitted samples."""
     rows = problem.fit_rows
     return {o: float(np.sqrt(np.mean(r[rows] ** 2))) for o, r in fitted.residual.items()}
 
 
 def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
-    """Mean square over noise variance on held-out samples, per output; 1 is perfect."""
+    """Return the mean square over noise variance on held-out samples, per output; 1 is perfect."""
     rows = problem.held_rows
     out: dict[str, float] = {}
     for o in problem.twin.outputs:
@@ -71,12 +71,12 @@ def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
 
 
 def misfit(problem: Problem, fitted: Fit) -> float:
-    """The same, averaged over outputs."""
+    """Return the mean over outputs of the mean square over noise variance on held-out samples."""
     return float(np.mean(list(misfits(problem, fitted).values())))
 
 
 def whiteners(problem: Problem, fitted: Fit) -> dict[str, Whitener]:
-    """Whitening filters of a model's residual, from held-out samples: no fit has flattened those."""
+    """Return the whitening filters of a model's residual from held-out samples, which no fit has flattened."""
     spans = problem.held_spans
     return {o: fit_whitener(r, stretches=spans) for o, r in fitted.residual.items()}
 
@@ -84,7 +84,7 @@ def whiteners(problem: Problem, fitted: Fit) -> dict[str, Whitener]:
 def direction_z(
     problem: Problem, small: Fit, change: dict[str, Array], filters: dict[str, Whitener], spans: list[Span]
 ) -> float:
-    """Whitened correlation of ``change`` (what a larger model would take away) with the residual of ``small``."""
+    """Return the whitened correlation of ``change`` (by a larger model) with the residual of ``small``."""
     top = bottom = 0.0
     for o in problem.twin.outputs:
         r, d = small.residual[o], change[o]
@@ -108,7 +108,7 @@ def direction_z(
 
 
 def compare(problem: Problem, small: Fit, large: Fit) -> Comparison:
-    """Everything that decides between a model and a larger one."""
+    """Compute all figures that decide between a model and a larger one."""
     filters = whiteners(problem, large)
     change = {o: small.residual[o] - large.residual[o] for o in problem.twin.outputs}
     z = direction_z(problem, small, change, filters, problem.held_spans)

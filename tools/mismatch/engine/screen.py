@@ -1,4 +1,4 @@
-"""Which effects may matter: every candidate place tried with one step inside the simulator."""
+"""Screens effects: every candidate place is tried with one step inside the simulator."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect at a place, its settings read off the fit part, with the outcome of one step.
+    """Holds an effect at a place, with settings from the fit part, and the outcome of one step.
 
-    ``share``: part of the residual's weighted mean square that one step takes on fit samples; ``p_value`` of the
-    score test; ``tested``: by the effect's own test instead (lines, bursts, steps, grids).
+    ``share``: part of the residual's weighted mean square that one step explains on fit samples; ``p_value`` of the
+    score test; ``tested``: the effect's own test is used instead (lines, bursts, steps, grids).
     """
 
     placed: Placed
@@ -36,18 +36,18 @@ class Candidate:
 
 
 def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, ...]) -> list[Placed]:
-    """Every place that a candidate effect may take beside those present."""
+    """Return every place that a candidate effect may take beside those present."""
     out: list[Placed] = []
     for effect in effects:
         for place in sites(problem.twin, problem.recording, effect, present):
-            taken = any(p.effect.name == effect.name and _same_place(p, place) for p in present)
-            if not taken:
+            is_present = any(p.effect.name == effect.name and _same_place(p, place) for p in present)
+            if not is_present:
                 out.append(place)
     return out
 
 
 def _same_place(present: Placed, place: Placed) -> bool:
-    """Return whether two places move the same outputs, but for forces and flows at different states."""
+    """Return True if two places move the same outputs, except for forces and flows at different states."""
     if present.site == place.site == "feedback":
         return bool(set(present.target.split("+")) & set(place.target.split("+")))
     return bool(set(present.outputs) & set(place.outputs))
@@ -55,9 +55,11 @@ def _same_place(present: Placed, place: Placed) -> bool:
 
 @dataclass(frozen=True)
 class Ground:
-    """What every candidate is screened against: ``samples`` of the recording and their ``rows`` in the view, the
-    outputs' movement with each searched parameter of the current model there (``bends[o]`` (rows, k)), and the energy
-    that is left to each output when everything free is regressed out.
+    """Holds the common data of the screen of all candidates.
+
+    It has ``samples`` of the recording and their ``rows`` in the view; derivatives of the outputs with respect to each
+    searched parameter of the current model there (``bends[o]`` (rows, k)); and the energy of each output when
+    everything free is regressed out.
     """
 
     rows: NDArray[np.int64]
@@ -66,12 +68,12 @@ class Ground:
     energy: dict[str, float]
 
 
-ROWS = 12_000  # of the fit, that a screen looks at
-OWN_SHARE = 0.05  # of what the engineer's base leaves: an effect that takes less there has only the base to thank
+ROWS = 12_000  # number of rows of the fit that a screen uses
+OWN_SHARE = 0.05  # least share of the residual of the engineer's base that an effect must explain by itself
 
 
 def bend(problem: Problem, current: Fit) -> Ground:
-    """The ground that the candidates share, with the sensitivities by forward differences."""
+    """Return the common data of the candidates, with sensitivities by forward differences."""
     model, theta = current.model, current.theta
     rows = spread(problem.fit_rows, ROWS, problem.seed)
     samples = problem.index[rows]
@@ -97,8 +99,10 @@ def bend(problem: Problem, current: Fit) -> Ground:
 
 
 def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
-    """Score test of one candidate: the simulator's output moved by the effect at each of its starting points,
-    regressed on the residual together with everything that is free already (``ground`` from ``bend``).
+    """Apply the score test to a candidate.
+
+    The residual is regressed on the change of the simulated output by the effect at each of its starting points,
+    together with everything that is free already (``ground`` from ``bend``).
     """
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
@@ -131,7 +135,7 @@ def _is_about(hint: Hint, place: Placed) -> bool:
 
 
 def _from_hint(problem: Problem, current: Fit, hint: Hint, ground: Ground) -> Candidate:
-    """One step from where a part of the recording had its best fit; its base, too, while no other effect is there."""
+    """Test one step from the best fit on a part of the recording; its base is used, too, without other effects."""
     model = Model(problem.twin, (*current.model.placed, hint.placed))
     theta = model.carry(current.model, current.theta, problem.recording)
     if not current.model.placed:
@@ -143,15 +147,15 @@ def _from_hint(problem: Problem, current: Fit, hint: Hint, ground: Ground) -> Ca
 
 
 def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, ground: Ground) -> tuple[float, float]:
-    """(share of the mean square taken, p-value of the F test) by one linear step from ``theta``."""
+    """Return (explained share of the mean square, p-value of the F test) of one linear step from ``theta``."""
     outputs = model.together(model.placed[-1].outputs)
     rows = ground.rows
     design = model.design(problem.view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
-    # the design at these parameters holds the simulation, too
+    # the design at these parameters contains the simulation
     moved = {o: design.constant[o] + design.columns[o] @ theta[list(design.linear[o])] for o in outputs}
-    # a start on another base is measured from there: what that base does without the effect is not the effect's share
+    # a start on another base is compared with that base without the effect, whose gain is not the effect's share
     base = current.theta.copy()
     base[: model.n_base] = theta[: model.n_base]
     elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
@@ -195,7 +199,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     e0, more = known.less(e), known.less(more)
     size = np.linalg.norm(more, axis=0)
     more = more[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
-    # outputs that share nothing with the candidate keep what they have
+    # outputs that share nothing with the candidate keep their residual
     idle = sum(ground.energy[o] for o in problem.twin.outputs if o not in outputs)
     before_ = float(e0 @ e0) + idle
     if before_ <= 0 or more.shape[1] == 0:
@@ -208,7 +212,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     after = float(left @ left) + idle
     dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - old[0].shape[1], 1)
     f = (null - after) / more.shape[1] / max(after / dof, 1e-300)
-    # what another base does by itself is not the effect's
+    # the gain of another base by itself is not the effect's
     share = 1 - after / (before_ if null - after > OWN_SHARE * null else null)
     return max(0.0, share), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
 
@@ -218,9 +222,9 @@ def _is_weight(model: Model, j: int) -> bool:
 
 
 class Regression:
-    """Least squares on columns of which each block of rows (an output) sees few: zeros are not multiplied.
+    """Solves least squares with columns of which each block of rows (an output) has few: zeros are not multiplied.
 
-    ``blocks``: (rows, columns) each, of the same size; the columns are those of all blocks on top of one another.
+    ``blocks``: (rows, columns) each, of the same size; the columns are those of all blocks, stacked.
     """
 
     def __init__(self, blocks: Sequence[Array]) -> None:
@@ -242,7 +246,7 @@ class Regression:
             self.inverse = root @ root.T
 
     def less(self, y: Array) -> Array:
-        """``y`` (rows of all blocks[, m]) less its projection on the columns."""
+        """Return ``y`` (rows of all blocks[, m]) less its projection on the columns."""
         parts = np.split(y, len(self.blocks))
         seen = np.zeros((self.inverse.shape[0], *y.shape[1:]))
         for (at, x), part in zip(self.blocks, parts, strict=True):

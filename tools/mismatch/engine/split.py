@@ -1,4 +1,4 @@
-"""What may be fitted and what is held out: contiguous segments with guard gaps, scored in many blocks."""
+"""Splits a recording into fitted and held-out parts: contiguous segments with guard gaps, scored in many blocks."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Split:
-    """``fit`` and ``held_out`` are spans of samples (stop excluded) that never touch; ``blocks`` cut the held-out
-    spans, ``fit_blocks`` the fit spans, for paired comparisons. ``n`` samples in all.
+    """Holds the spans ``fit`` and ``held_out`` of samples (stop excluded), which never touch.
+
+    ``blocks`` cut the held-out spans, ``fit_blocks`` the fit spans, for paired comparisons. ``n`` is the number of all
+    samples.
     """
 
     n: int
@@ -33,7 +35,7 @@ class Split:
         return _mask(self.n, self.held_out)
 
     def first(self, samples: int) -> Split:
-        """The same split of the first ``samples`` alone."""
+        """Return the same split of the first ``samples`` alone."""
 
         def of(spans: tuple[Span, ...]) -> tuple[Span, ...]:
             return tuple((a, min(b, samples)) for a, b in spans if a < samples)
@@ -49,7 +51,7 @@ def _mask(n: int, spans: tuple[Span, ...]) -> NDArray[np.bool_]:
 
 
 def cut(spans: tuple[Span, ...], at_least: int) -> tuple[Span, ...]:
-    """Spans cut into about equal blocks, ``at_least`` so many where their length allows (8 samples each)."""
+    """Cut spans into about equal blocks, ``at_least`` so many if their length allows (8 samples each)."""
     total = sum(b - a for a, b in spans)
     if total == 0:
         return ()
@@ -63,9 +65,10 @@ def cut(spans: tuple[Span, ...], at_least: int) -> tuple[Span, ...]:
 
 
 def _coverage(signals: Array, held: NDArray[np.bool_], used: NDArray[np.bool_]) -> float:
-    """Largest distance between the distributions of held-out and fitted samples, over signals, in units of its spread:
-    tails count as much as the middle (T. W. Anderson, D. A. Darling, Ann. Math. Stat. 23 (1952) 193), for limits and
-    edges are seldom and both parts shall have some.
+    """Return the largest distance between the distributions of held-out and fitted samples over all signals.
+
+    It is in units of its standard deviation, so that tails count as much as the middle (T. W. Anderson, D. A. Darling,
+    Ann. Math. Stat. 23 (1952) 193): limits and edges are rare, and both parts must have some.
     """
     worst = 0.0
     levels = np.array([0.003, 0.01, 0.03, *np.linspace(0.05, 0.95, 19), 0.97, 0.99, 0.997])
@@ -81,12 +84,11 @@ def _coverage(signals: Array, held: NDArray[np.bool_], used: NDArray[np.bool_]) 
 def own_split(
     signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: int = 0, segments: int = 6, begin: int = 0
 ) -> Split:
-    """Split of a recording that brings none.
+    """Split a recording that has no split of its own.
 
     ``signals`` (n, k): inputs and context, whose values and rates both parts shall cover. The record is cut into
-    ``segments`` stretches; each gives a contiguous held-out part with ``guard`` samples on either side that
-    nobody uses; nor does anybody use what is before sample ``begin``. Of 24 seeded layouts the one whose parts
-    resemble each other most is taken.
+    ``segments`` stretches; each gives a contiguous held-out part with ``guard`` unused samples on either side. Samples
+    before ``begin`` are not used either. Of 24 seeded layouts the one with the most similar parts is chosen.
     """
     n = signals.shape[0]
     segments = max(1, min(segments, n // 60))
@@ -101,7 +103,7 @@ def own_split(
         for i in range(segments):
             length = int(held_out * (edges[i + 1] - edges[i]))
             room = edges[i + 1] - edges[i] - length
-            # never the first stretch of the record: the fit needs to see how everything starts
+            # the first stretch of the record is never held out, because the fit needs the start
             least = max(int(0.25 * room), begin + guard) if i == 0 else 0
             start = int(edges[i] + rng.integers(least, max(room, least + 1)))
             held.append((start, start + length))
@@ -127,7 +129,7 @@ def _with_guard(n: int, held: tuple[Span, ...], guard: int, begin: int) -> Split
 
 
 def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Split:
-    """The split that a recording brings: its own fit range, its test range less the samples that set the state."""
+    """Return the recording's own split: its fit range, and its test range less the samples that set the state."""
     start = test[0] + max(initialization, 0)
     held = ((start, test[1]),)
     return Split(n, (fit,), held, cut(held, 30), cut((fit,), 48), own=False)
@@ -136,10 +138,10 @@ def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Sp
 def split_of_parts(
     signals: Array, parts: Sequence[Span], *, held_out: float = 0.3, seed: int = 0, init: int = 0, skip: float = 0.0
 ) -> Split:
-    """Split that holds whole recordings out: of 24 seeded choices the one whose parts resemble each other most.
+    """Return a split that holds whole recordings out: of 24 seeded choices the one with the most similar parts.
 
     ``signals`` (n, k); ``parts`` the samples of each recording (two at least); ``init`` samples set the start state of
-    a held-out one, the share ``skip`` at the start of each is simulated and not judged.
+    a held-out one, the share ``skip`` at the start of each is simulated and not scored.
     """
     n = signals.shape[0]
     count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
@@ -157,17 +159,18 @@ def split_of_parts(
 
 
 def leave_out(n: int, parts: Sequence[Span], out: Collection[int], *, init: int = 0, skip: float = 0.0) -> Split:
-    """The split of ``n`` samples that holds the recordings with numbers ``out`` out and fits the others."""
-    begun = [(a + int(skip * (b - a)), b) for a, b in parts]
-    fit = tuple(s for i, s in enumerate(begun) if i not in out)
-    held = tuple((a + init, b) for i, (a, b) in enumerate(begun) if i in out)
+    """Return the split of ``n`` samples that holds out the recordings with numbers ``out`` and fits the others."""
+    spans = [(a + int(skip * (b - a)), b) for a, b in parts]
+    fit = tuple(s for i, s in enumerate(spans) if i not in out)
+    held = tuple((a + init, b) for i, (a, b) in enumerate(spans) if i in out)
     return Split(n, fit, held, cut(held, 30), cut(fit, 48), own=False)
 
 
 def shot(split: Split, init: int, pieces: int = 24) -> Split:
-    """The same parts in about ``pieces`` stretches each, for a twin that starts every stretch afresh (multiple
-    shooting: Bock, Springer Series in Chemical Physics 18, 1981). The free run of an integrator over a whole record
-    says more about its start than about its physics.
+    """Return the same parts in about ``pieces`` stretches each, for a twin that restarts in every stretch.
+
+    This is multiple shooting (Bock, Springer Series in Chemical Physics 18, 1981): the free run of an integrator over a
+    whole record depends more on its start than on its physics.
     """
 
     def stretches(spans: tuple[Span, ...], skip: int) -> tuple[Span, ...]:

@@ -1,4 +1,4 @@
-"""One candidate added to a model and judged; many candidates in parallel processes."""
+"""Adds candidates to a model and judges them, many candidates in parallel processes."""
 
 from __future__ import annotations
 
@@ -19,38 +19,43 @@ from tools.mismatch.simulate import Model
 Array = np.ndarray
 Progress = Callable[[str, int, int], None]
 
-LEAST_SHARE = 0.004  # of the residual's mean square, by one step
-LEAST_FITS = 3  # per output, whatever their share
+LEAST_SHARE = 0.004  # least share of the residual's mean square that one step must explain
+LEAST_FITS = 3  # number of candidates per output that are fitted independent of their share
 MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
 LEAST_P = 1e-3
-TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is accepted is fitted on every row
+TRIAL_ROWS = 12_000  # number of rows, over all outputs, of a candidate's fit; accepted ones are fitted on every row
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is spent on a candidate. A candidate that gains less than ``share`` of what one step of the best gains
-    in log density, or less than ``least`` (a share of the mean square of its outputs), is not refined.
+    """Limits the effort on a candidate.
+
+    A candidate is not refined if it gains less than ``share`` of the best one-step gain in log density, or less than
+    ``least`` (a share of the mean square of its outputs).
     """
 
     share: float
     least: float
 
     def most_left(self, top: float) -> float:
-        """Share of an output's mean square that a candidate may leave there, where one step of the best takes ``top``:
-        the log density falls with the logarithm of what is left."""
+        """Return the largest share of an output's mean square that a refined candidate may leave.
+
+        One step of the best candidate explains ``top``; the log density falls with the logarithm of the rest.
+        """
         return min((1.0 - min(top, MOST_TOP)) ** self.share, 1.0 - self.least)
 
 
 MOST_TOP = 0.999
-"""Share of an output's mean square that one step can be said to take at most: what is left is noise."""
+"""Largest share of an output's mean square that one step is credited with; the rest is noise."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfits`` per output on held-out
-    samples (1 is perfect).
+    """Holds a candidate's outcome: ``fitted`` is None if the screen dropped it.
+
+    ``misfits`` are per output on held-out samples (1 is perfect).
     """
 
     placed: Placed
@@ -65,18 +70,18 @@ class Trial:
 
     @property
     def refused(self) -> bool:
-        """Whether the effect's own test finds nothing of it: then no fit, alone or with others, makes it a name."""
+        """Return True if the effect's own test is negative: then no fit, alone or with others, makes it a name."""
         return self.candidate.tested and self.candidate.p_value > LEAST_P
 
 
 def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Array]:
-    """The model of ``current`` with one more effect, and its parameters carried over."""
+    """Return the model of ``current`` with one more effect, and its parameters carried over."""
     model = Model(problem.twin, (*current.model.placed, placed))
     return model, model.carry(current.model, current.theta, problem.recording)
 
 
 def screen_one(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
-    """One step of one candidate."""
+    """Screen a candidate by one step."""
     return one_step(problem, current, place, ground)
 
 
@@ -88,9 +93,9 @@ def fit_one(
     tops: dict[str, float],
     effort: Effort,
 ) -> Trial:
-    """Fit one candidate jointly with everything that is there, compare on held-out samples.
+    """Fit a candidate jointly with the current model and compare them on held-out samples.
 
-    ``tops``: the best one-step share per output; who stays far below it is not refined, as ``effort`` says.
+    ``tops``: the best one-step share per output; a candidate far below it is not refined, as ``effort`` states.
     """
     model, _ = extended(problem, current, candidate.placed)
     rows = problem.fit_rows
@@ -108,13 +113,13 @@ def fit_one(
 
 
 def freedom(candidate: Candidate) -> int:
-    """Return how many parameters an effect brings."""
+    """Return the number of parameters of an effect."""
     parts = candidate.placed.parts
     return len(parts.nonlinear) + len(parts.weights)
 
 
 def vouched(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Forms of one effect at one place share the clearest of their own tests, corrected for how many there are."""
+    """Give all forms of an effect at a place the clearest of their own tests, corrected for the number of forms."""
     tests: dict[tuple[str, ...], list[float]] = {}
     place = lambda c: (c.placed.effect.name, c.placed.site, c.placed.target)  # noqa: E731
     for c in candidates:
@@ -125,9 +130,11 @@ def vouched(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int = MOST_FITS) -> list[bool]:
-    """Return which candidates deserve a fit: per output the best by their one-step share, specific effects, flexible
-    families (one step flatters these) and events or noise with a test of their own ranked apart (of each ``least``,
-    and up to ``most`` that are near the best), and whatever is clear by that test. Forms of one effect take one rank.
+    """Select the candidates for a fit: per output the best by their one-step share.
+
+    Specific effects, flexible families (which one step overestimates) and events or noise with a test of their own are
+    ranked separately (of each ``least``, and up to ``most`` that are near the best). Candidates that are clear by their
+    own test are added. Forms of an effect share one rank.
     """
     keep = [False] * len(candidates)
     outputs = sorted({o for c in candidates for o in c.placed.outputs})
@@ -162,12 +169,12 @@ def try_all(
     least: int = LEAST_FITS,
     most: int = MOST_FITS,
 ) -> list[Trial]:
-    """Every candidate screened, the ``hopeful`` ones fitted. The answer does not depend on ``jobs``."""
+    """Screen every candidate and fit the ``hopeful`` ones. The result does not depend on ``jobs``."""
 
     def run(function: Callable[..., Any], items: Sequence[Any], extra: tuple[Any, ...], label: str) -> list[Any]:
         work = [(problem, current, item, *extra) for item in items]
-        told = progress  # the type checker keeps it in the closure
-        tell = (lambda done: told(label, done, len(items))) if told else None
+        report_progress = progress  # the type checker keeps it in the closure
+        tell = (lambda done: report_progress(label, done, len(items))) if report_progress else None
         return mapped(problem, function, work, jobs, long=False, tell=tell)
 
     with np.errstate(all="ignore"):
@@ -187,7 +194,7 @@ def try_all(
 
 
 def _parts(problem: Problem, current: Fit) -> dict[str, float]:
-    """The share of every output in what ``current`` leaves on fitted samples, in noise variances."""
+    """Return the share of every output in the residual of ``current`` on fitted samples, in noise variances."""
     rows = problem.fit_rows
     left = {o: float(np.mean((r[rows] / problem.sigma(o)) ** 2)) for o, r in current.residual.items()}
     total = max(sum(left.values()), 1e-300)

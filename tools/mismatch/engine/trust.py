@@ -1,8 +1,8 @@
-"""Keeps a fit near the engineer's own values where the data say nothing, and checks what every fit must hold.
+"""Keeps undetermined parameters near the engineer's own values, and checks the requirements on every fit.
 
-A weak normal prior on the base parameters is centred on the values of the recording's twin. What the data determine
-is not moved by it (its weight is that of less than one sample); what they do not determine stays as given: a parameter
-that no output depends on, an offset beside an integrator, the free directions of a change of coordinates.
+A weak normal prior on the base parameters is centred on the values of the recording's twin. It does not move parameters
+that the data determine (its weight is below that of one sample). Undetermined ones stay as given: a parameter that no
+output depends on, an offset beside an integrator, the free directions of a change of coordinates.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ LOG_WIDTH = 1.5
 TIMES_GIVEN = 10.0
 """Standard deviation of the prior of any other parameter, in units of the engineer's own value."""
 TIMES_SCALE = 1000.0
-"""The same in units of the parameter's typical step, where that is wider (an offset that was given as zero)."""
+"""Standard deviation in units of the parameter's typical step, used if it is wider (an offset given as zero)."""
 FAR = 1e3
-"""A simulation whose residual exceeds the largest recorded value by this factor has run away."""
+"""Ratio of the residual to the largest recorded value above which a simulation has diverged."""
 
 
 def to_search(p: Free, v: float) -> float:
-    """A parameter in the coordinate that is searched: its logarithm where only its size is uncertain."""
+    """Return a parameter in its search coordinate: the logarithm if only its size is uncertain."""
     return float(np.log(max(v, 1e-300))) if p.log and p.lo > 0 else v
 
 
 @dataclass(frozen=True)
 class Belief:
-    """Centre and width (parameters,) of the prior, in search coordinates; an infinite width is no prior."""
+    """Holds centre and width (parameters,) of the prior, in search coordinates; an infinite width is no prior."""
 
     centre: Array
     width: Array
 
 
 def belief(problem: Problem, model: Model) -> Belief:
-    """The prior of every parameter of ``model``: normal for base parameters, none for those of effects."""
+    """Return the prior of every parameter of ``model``: normal for base parameters, none for those of effects."""
     centre, width = np.zeros(len(model.parameters)), np.full(len(model.parameters), np.inf)
     given = problem.given
     for i, p in enumerate(model.parameters[: model.n_base]):
@@ -58,7 +58,7 @@ def belief(problem: Problem, model: Model) -> Belief:
 
 
 def stayed(problem: Problem, residual: Mapping[str, Array]) -> bool:
-    """Whether a simulation stayed within reach of the recording: finite, and within ``FAR`` times its largest value."""
+    """Return True if a simulation did not diverge: it is finite and within ``FAR`` times the largest recorded value."""
     return all(
         bool(np.all(np.abs(r) <= FAR * float(np.max(np.abs(problem.recording.outputs[o])))))
         for o, r in residual.items()
@@ -66,16 +66,16 @@ def stayed(problem: Problem, residual: Mapping[str, Array]) -> bool:
 
 
 def fit_loss(problem: Problem, residual: Mapping[str, Array]) -> float:
-    """Mean square over noise variance on the fitted samples, averaged over outputs; every sample counts alike."""
+    """Return the mean square over noise variance on the fitted samples, averaged over outputs, without weights."""
     rows = problem.fit_rows
     return float(np.mean([np.mean((r[rows] / problem.sigma(o)) ** 2) for o, r in residual.items()]))
 
 
 def broken(problem: Problem, given: Mapping[str, Array], theta: Array, residual: Mapping[str, Array]) -> str:
-    """Return which of the things that every accepted fit must hold is broken ("" if none), as one sentence.
+    """Return the requirement that a fit violates, as a sentence ("" if none).
 
-    ``given``: the residual of the twin as given. A fit is finite, its simulation stays within reach of the recording,
-    and it is no worse on the fitted samples than the twin as given.
+    ``given``: the residual of the twin as given. An accepted fit is finite, its simulation does not diverge, and it is
+    no worse on the fitted samples than the twin as given.
     """
     if not np.all(np.isfinite(theta)):
         return "A fitted parameter was not finite."

@@ -1,4 +1,4 @@
-"""What is left and fits nothing: what it follows, how strongly, and whether that is enough to say so."""
+"""Judges the unexplained rest: the signals that it follows, the strength, and the significance."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Leftover:
-    """Per output: ``ratio`` residual mean square over noise variance on held-out samples, ``follows`` what the
-    residual follows (strongest first), ``memory_p`` the p-value that history adds nothing, ``real`` whether it
-    is more than noise of whatever colour.
+    """Holds the rest of an output.
+
+    ``ratio`` is the residual mean square over noise variance on held-out samples; ``follows`` lists the features that
+    it follows, strongest first; ``memory_p`` is the p-value of no memory; ``real`` is True if the rest is more than
+    noise of any colour.
     """
 
     output: str
@@ -33,7 +35,7 @@ class Leftover:
     real: bool
 
     def led_by(self, found: Stranger) -> Leftover:
-        """The same with a context signal in front of everything else that is followed."""
+        """Return the rest with a context signal in front of all other followed features."""
         first = Dependence(found.signal, found.feature, found.p_value, found.share, False)
         return Leftover(self.output, self.ratio, (first, *self.follows), self.memory_p, True)
 
@@ -41,25 +43,26 @@ class Leftover:
 def leftover(
     problem: Problem, fitted: Fit, output: str, *, p_limit: float = 1e-6, least: float = 0.03, least_size: float = 0.05
 ) -> Leftover:
-    """Judge what one output has left."""
+    """Judge the rest of an output."""
     s = problem.sigma(output)
     r = winsorised(fitted.residual[output][problem.held_rows], s, problem.lively[problem.held_rows])
     ratio = float(np.mean((r / s) ** 2))
     found, memory = follow(problem, fitted, output)
-    said = [d for d in found if d.p_value < p_limit and d.strength > least]
-    followed = any(d.feature != "time itself" for d in said)
+    significant = [d for d in found if d.p_value < p_limit and d.strength > least]
+    followed = any(d.feature != "time itself" for d in significant)
     if not followed:
         sizes = [d for d in follow_size(problem, fitted, output) if d.p_value < p_limit and d.strength > least_size]
         followed = bool(sizes)
-        said += sizes
+        significant += sizes
     loud = problem.floors[output].declared and ratio > 1.5
-    return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
+    return Leftover(output, ratio, tuple(significant), memory, bool(followed or loud))
 
 
 @dataclass(frozen=True)
 class Stranger:
-    """A recorded context signal that a free curve follows better than named effects do: ``share`` of the residual's
-    mean square that the curve predicts on blocks it has not seen.
+    """Holds a recorded context signal whose free curve explains the residual better than named effects do.
+
+    ``share`` is the part of the residual's mean square that the curve predicts on held-out blocks.
     """
 
     output: str
@@ -70,20 +73,22 @@ class Stranger:
 
 
 def about(effect: Effect) -> tuple[str, ...]:
-    """Recorded conditions that an effect is about."""
+    """Return the recorded conditions that an effect uses."""
     return ("actuator_current", "current") if effect.name == "current_coupling" else effect.needs
 
 
 def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> tuple[list[Feature], Array]:
-    """Return what a context signal may do that no effect is about: an offset by a curve of it, and that curve times the
-    drive, the plant's motion, or the rate of either. And what these do on their own (n, k): such products hold it too.
+    """Return features of a context signal that no effect describes, and the movers alone (n, k).
+
+    The features are an offset by a curve of the signal, and that curve times a mover: the drive, the plant's motion, or
+    the rate of either. Such products contain the movers as well.
     """
     _, signals, dt = thinned(problem, before, output)
     drive = problem.twin.drive(output)
     movers = [standard(signals[i]) for i in sorted(problem.twin.inputs, key=lambda i: i != drive)]
     motion = standard(block_means(problem.measured[output] - before.residual[output], dt, problem))
     if not any(alike(motion, m) for m in movers):
-        # a plant's own course, or a reading made of several inputs: the gain of a channel acts on it
+        # the gain of a channel acts on a plant's own course, or on a reading that is made of several inputs
         movers.append(motion)
     found: list[Feature] = []
     for name in names:
@@ -104,14 +109,14 @@ def context_features(problem: Problem, before: Fit, output: str, names: Iterable
 
 
 def lead(problem: Problem, fitted: Fit, output: str, *, least: float = 0.3, p_limit: float = 1e-8) -> Stranger | None:
-    """The context signal, about which no placed effect is, that most of what is left follows, if there is one."""
+    """Return the context signal, not used by a placed effect, that most of the rest follows, if there is one."""
     used = {s for p in fitted.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
     return _plainest(problem, fitted, output, names, p_limit, lambda share: share > least)
 
 
 def block_means(x: Array, dt: float, problem: Problem) -> Array:
-    """``x`` (m,) on the view, averaged to the step ``dt`` of ``thinned``."""
+    """Return ``x`` (m,) on the view, averaged to the step ``dt`` of ``thinned``."""
     k = max(1, round(dt / problem.recording.dt))
     m = x.size // k
     return x[: m * k].reshape(m, k).mean(axis=1)
@@ -120,13 +125,13 @@ def block_means(x: Array, dt: float, problem: Problem) -> Array:
 def _plainest(
     problem: Problem, fitted: Fit, output: str, names: Sequence[str], p_limit: float, enough: Callable[[float], bool]
 ) -> Stranger | None:
-    """Of the features of the context signal that takes most, the plainest that takes nearly as much."""
+    """Return the simplest feature of the best context signal that explains nearly as much as its best one."""
     if not names:
         return None
     e = thinned(problem, fitted, output)[0]
     features, own = context_features(problem, fitted, output, names)
     beyond = without(e, own)
-    # both sides less what the movers do on their own (Frisch and Waugh): a gain holds a share of its mover
+    # the movers are projected out of both sides (Frisch and Waugh), because a gain contains a share of its mover
     features = [replace(f, columns=without(f.columns, own)) for f in features]
     part = float(np.var(beyond) / max(float(np.var(e)), 1e-300))
     best: Stranger | None = None
@@ -141,7 +146,7 @@ def _plainest(
 
 
 def without(x: Array, own: Array) -> Array:
-    """``x`` (n,) or (n, k) less its projection on the columns of ``own`` (n, j)."""
+    """Return ``x`` (n,) or (n, k) less its projection on the columns of ``own`` (n, j)."""
     size = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
     return x - (own / size) @ np.linalg.lstsq(own / size, x, rcond=1e-8)[0]
 
@@ -150,5 +155,5 @@ _PLAIN = ("value", "rate", "cross product", "cross product with rate")
 
 
 def plainer(a: str, b: str) -> bool:
-    """Is feature ``a`` the simpler statement."""
+    """Return True if feature ``a`` is the simpler statement."""
     return _PLAIN.index(a) < _PLAIN.index(b)

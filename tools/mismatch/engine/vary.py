@@ -1,4 +1,4 @@
-"""A fitted set of effects with one left out, one more, or one replaced; and what an effect brings."""
+"""Varies a fitted set of effects: one left out, one more, or one replaced; counts an effect's parameters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tools.mismatch.simulate_start import prepare, starts
 
 
 def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
-    """The fit without one of its effects, everything else fitted again."""
+    """Return the fit without one of its effects, everything else fitted again."""
     placed = [p for j, p in enumerate(fitted.model.placed) if j != drop]
     model = Model(problem.twin, placed)
     theta = model.carry(fitted.model, fitted.theta, problem.recording)
@@ -21,13 +21,13 @@ def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
 
 
 def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
-    """The fit with one effect replaced by a rival, prepared and started from what the others leave."""
+    """Return the fit with one effect replaced by a rival, prepared and started from the residual of the others."""
     rest = reduced(problem, fitted, drop)
     return added(problem, rest, rival)
 
 
 def added(problem: Problem, current: Fit, place: Placed) -> Fit:
-    """The fit with one more effect, from its own starting points."""
+    """Return the fit with one more effect, from its own starting points."""
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
@@ -36,7 +36,7 @@ def added(problem: Problem, current: Fit, place: Placed) -> Fit:
 
 
 def beyond_limits(fitted: Fit, placed: Placed) -> bool:
-    """Return whether a report figure of a fitted effect is beyond what its physics can be."""
+    """Return True if a human parameter of a fitted effect is outside its physical range."""
     limits, forbidden = placed.effect.limits, placed.effect.forbidden
     if not limits and not forbidden:
         return False
@@ -46,7 +46,7 @@ def beyond_limits(fitted: Fit, placed: Placed) -> bool:
 
 
 def size(placed: Placed) -> int:
-    """Return how many numbers an effect brings, events read off the data included."""
+    """Return the number of parameters that an effect brings, including events read off the data."""
     parts = placed.parts
     events = sum(len(placed.settings.get(key, ())) for key in ("at", "shift", "times_s", "starts"))
     return len(parts.nonlinear) + len(parts.weights) + events

@@ -1,4 +1,4 @@
-"""The verdict: agrees, recalibrate, missing physics, unexplained."""
+"""Decides the verdict: agrees, recalibrate, missing physics, unexplained."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ OF_THE_CLOCK = frozenset(
         "vibration",
     )
 )  # fmt: skip
-"""Effects that come with time or grow with it; all others are driven by recorded signals."""
+"""Effects that occur in time or grow with it; all others are driven by recorded signals."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """``verdict``; ``p_value`` that nothing is missing; ``meaning`` of an ``unexplained``, "" for other verdicts;
-    ``trouble``: in words, what went wrong in the fit; ``floors``: per output the interval of the noise rms;
-    ``doubtful``: outputs whose verdict is another at the two ends of that interval.
+    """Holds the ``verdict`` and its grounds.
+
+    ``p_value``: that nothing is missing; ``meaning`` of an ``unexplained``, "" for other verdicts; ``trouble``:
+    failures of the fit, in words; ``floors``: per output the interval of the noise rms; ``doubtful``: outputs whose
+    verdict differs between the two ends of that interval.
     """
 
     verdict: Verdict
@@ -40,21 +42,21 @@ class Decision:
 
 
 def within_tolerance(problem: Problem, fitted: Fit) -> dict[str, bool]:
-    """Per output: whether a tolerance is declared and the held-out residual is within it."""
+    """Return per output if a tolerance is declared and the held-out residual is within it."""
     limits = problem.recording.tolerance
     return {o: o in limits and v <= limits[o] for o, v in held_rms(problem, fitted).items()}
 
 
 RAN_AWAY = 10.0
-"""Times the range of a recorded output beyond which a simulation is no account of it."""
+"""Residual, in ranges of a recorded output, above which a simulation has diverged."""
 WORSE = 1.2
-"""Held-out residual of the re-fitted twin over that of the twin as given, above which the fit failed."""
+"""Ratio of the held-out residual of the re-fitted twin to that of the twin as given above which the fit failed."""
 NOT_HELD = 4.0
-"""Held-out over fitted residual above which what was fitted does not hold elsewhere."""
+"""Ratio of held-out to fitted residual above which the fit does not generalise."""
 
 
 def fit_trouble(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> tuple[str, ...]:
-    """Return what went wrong in the fit, in words, worst first; empty when the fit holds."""
+    """Return the failures of the fit in words, worst first; empty if it did not fail."""
     out: list[str] = []
     given, alone, final = held_rms(problem, raw), held_rms(problem, base), held_rms(problem, fitted)
     seen = fit_rms(problem, fitted)
@@ -77,13 +79,13 @@ def fit_trouble(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> tuple[str
 
 
 def at_end(p: Free, value: float) -> bool:
-    """Return whether a base parameter sits at a finite end of its range that zero does not explain."""
+    """Return True if a base parameter is at a finite bound of its range that zero does not explain."""
     ends = [b for b in (p.lo, p.hi) if np.isfinite(b) and b != 0.0]
     return any(abs(value - b) <= 1e-6 * max(abs(b), abs(p.scale)) for b in ends)
 
 
 def meaning_of(problem: Problem, left: dict[str, Leftover], trouble: Sequence[str]) -> Meaning:
-    """Return what an ``unexplained`` means whose residual stands above the noise wherever in its interval that lies."""
+    """Return the meaning of an ``unexplained`` whose residual exceeds the noise at both ends of its interval."""
     if trouble:
         return "fit_failed"
     twin = problem.twin
@@ -94,5 +96,5 @@ def meaning_of(problem: Problem, left: dict[str, Leftover], trouble: Sequence[st
 
 
 def compare_ratio(problem: Problem, fitted: Fit, output: str) -> float:
-    """Held-out mean square over noise variance."""
+    """Return the held-out mean square over noise variance."""
     return float(np.mean((fitted.residual[output][problem.held_rows] / problem.sigma(output)) ** 2))

@@ -1,4 +1,4 @@
-"""When it is worst: the residual's energy in blocks, cut into windows of constant level."""
+"""Finds when a mismatch is worst: the residual's energy in blocks, cut into windows of constant level."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def change_points(x: Array, penalty: float | None = None) -> list[int]:
-    """Edges (0 and len included) of the best piecewise constant fit of ``x`` (b,).
+    """Return the edges (0 and len included) of the best piecewise constant fit of ``x`` (b,).
 
     Optimal partitioning (Jackson et al., IEEE Signal Processing Letters 12, 2005) with a penalty per segment of
     3 log(b) noise variances; the noise from first differences.
@@ -40,13 +40,13 @@ def change_points(x: Array, penalty: float | None = None) -> list[int]:
 
 
 EVERYWHERE = 0.8
-"""Share of the record above the noise from which a location that names all of it says nothing."""
+"""Share of the record above the noise from which only the loudest windows are named."""
 MOST_ENERGY = 0.8
-"""Share of the energy above the noise that the windows named then hold."""
+"""Share of the energy above the noise that the loudest windows contain."""
 
 
 def bad_windows(e: Array, noise_rms: float, dt: float, *, blocks: int = 96) -> list[tuple[float, float]]:
-    """Windows (start_s, stop_s) in which the residual ``e`` (n,) stands above its noise.
+    """Return the windows (start_s, stop_s) in which the residual ``e`` (n,) exceeds its noise.
 
     Neighbouring windows above are joined. Where more than ``EVERYWHERE`` of the record is above, the loudest segments
     that hold ``MOST_ENERGY`` of the excess; the whole record is one window only when it is as loud throughout.
@@ -74,8 +74,10 @@ def bad_windows(e: Array, noise_rms: float, dt: float, *, blocks: int = 96) -> l
 
 
 def _loudest(energy: Array, noise_rms: float) -> list[tuple[int, int]]:
-    """Runs of blocks [start, stop), as few blocks as hold ``MOST_ENERGY`` of what stands above the noise; a single
-    quieter block between two of them is taken along."""
+    """Return runs of blocks [start, stop), as few as contain ``MOST_ENERGY`` of the excess over the noise.
+
+    A single quieter block between two of them is included.
+    """
     excess = np.maximum(energy - noise_rms**2, 0.0)
     order = np.argsort(-excess, kind="stable")
     needed = int(np.searchsorted(np.cumsum(excess[order]), MOST_ENERGY * excess.sum())) + 1

@@ -1,4 +1,4 @@
-"""Independent pieces of work in parallel processes, where they are long enough to pay; the answer is the same."""
+"""Runs independent pieces of work in parallel processes if they are long enough; the result is the same."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from threadpoolctl import threadpool_limits
 from hal.children import begin_as_worker
 from tools.mismatch.engine.problem import Problem
 
-LEAST_SAMPLES = 40_000  # samples times outputs above which processes pay for a handful of pieces
-LEAST_WORK = 1_500_000  # samples times outputs times pieces above which they pay for any number
+LEAST_SAMPLES = 40_000  # samples times outputs above which processes save time for a few pieces
+LEAST_WORK = 1_500_000  # samples times outputs times pieces above which processes save time for any number
 
 
 def quietly(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """One piece, without warnings of trials that run away. In a worker process the linear algebra has one thread; in
-    the process that asks, whoever asks has limited it (looking for its libraries takes longer than many a piece).
+    """Run a piece of work without warnings of diverging trials.
+
+    In a worker process the linear algebra is limited to one thread here. In the calling process the caller limits it,
+    because the search for its libraries takes longer than many pieces.
     """
     if parent_process() is None:
         with np.errstate(all="ignore"):
@@ -38,8 +40,9 @@ def mapped(
     long: bool = True,
     tell: Callable[[int], None] | None = None,
 ) -> list[Any]:
-    """``function`` of every tuple of arguments in ``work``, in order. ``long``: a piece is a fit, not a look;
-    ``tell`` is called with how many are done.
+    """Return ``function`` of every tuple of arguments in ``work``, in order.
+
+    ``long``: a piece is a fit and not a screen; ``tell`` is called with the number of finished pieces.
     """
     size = problem.recording.n * len(problem.twin.outputs)
     pays = len(work) > 1 and (size * len(work) > LEAST_WORK or (long and size > LEAST_SAMPLES))
