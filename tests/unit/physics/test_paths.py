@@ -211,7 +211,7 @@ def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:
         (low_pass, (DT, 0.01, np.array([0, 70]))),
         (mode, (*(np.ascontiguousarray(m) for m in discrete_mode(30.0, 0.2, DT)), np.array([0, 70]))),
         (limit, (-0.5, 0.7, 0.05)),
-        (slew, (0.02, 0.03, 0.5, np.array([0, 70]), 3, True)),
+        (slew, ((0.02, 0.03), 0.5, np.array([0, 70]), 3, True)),
         (resample, (-3.3, 1.001, 1e-5)),
         (shift_by, (np.array([20, 90]), np.array([3, -1]))),
     ],

@@ -119,7 +119,7 @@ def test_compiled_and_python_agree():
     for function in (drive_stack, drive_stack.py_func):
         params, state = drive_channel(stack_unit(config.stack, 1, 0), config.amplifier, 1.25e-4, 25.0)
         x, v = np.empty(20), np.empty(20)
-        function(params, state, volts, 25.0, 8, x, v)
+        function(params, state, volts, 25.0, 8, (x, v))
         results.append((x, v))
     assert np.allclose(results[0], results[1], rtol=1e-12, atol=0.0)
 
