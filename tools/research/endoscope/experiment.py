@@ -17,7 +17,7 @@ Mapping = Literal["position", "speed"]
 
 @dataclass(frozen=True)
 class Cell:
-    """All experiments at one response time. ``elapsed_s`` in the order of the experiments."""
+    """Holds all experiments at one response time; ``elapsed_s`` is in the order of the experiments."""
 
     mapping: Mapping
     response_s: float

@@ -26,7 +26,7 @@ LIMIT_S = 600.0
 
 
 def task_of(game: GameConfig) -> Task:
-    """What a user knows of the device after having tried it."""
+    """Return the user's knowledge of the device after a trial."""
     control = game.control
     return Task(control.mapping, control.gain, control.response_s, game.tolerance_px)
 
@@ -92,7 +92,7 @@ class _HandsOn:
         self._clock.at(self._since_ns + round(STEP_S * 1e9), self._move)
 
     def see(self, state: GameState, t_ns: int) -> None:
-        """What the firmware shows."""
+        """Store the state that the firmware displays."""
         self._state = state
 
     def _move(self, t_ns: int) -> None:

@@ -34,7 +34,7 @@ REST_LAGS = 5.0
 
 
 class UserConfig(BaseModel):
-    """One person. Times in s, angles in deg."""
+    """Describes a person. Times in s, angles in deg."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -65,7 +65,7 @@ class UserConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Task:
-    """What the user knows of the device: it is tried out before the experiment."""
+    """Holds the user's knowledge of the device, which is tried out before the experiment."""
 
     mapping: Literal["position", "speed"]
     gain: float
@@ -180,7 +180,7 @@ class SyntheticUser:
     # ------------------------------------------------------------------ how to steer
 
     def _off(self, seen: GameState) -> Pair:
-        """What is to be corrected, with the eye's noise."""
+        """Return the error to be corrected, with the eye's noise."""
         x, y, size = seen.off_px
         eye = self.config.eye_px
         if self._goal == ZOOM:
@@ -209,14 +209,14 @@ class SyntheticUser:
         return t - self._good_since >= self.config.dwell_s
 
     def _aim_at(self, error: Pair) -> Pair:
-        """Where the hand must be, as well as that can be told beforehand."""
+        """Return the predicted target of the hand."""
         c = self.config
         goals = [self._command[i] - error[i] / self.task.gain * (1.0 + c.aim_spread * self._normal()) for i in range(2)]
         x, y = (min(max(goal, -c.reach_deg), c.reach_deg) for goal in goals)
         return x, y
 
     def _aiming(self, error: Pair, t: float, dt: float) -> bool:
-        """One step of the aimed movement, or of waiting for what it did; False when there is nothing left of it."""
+        """Make a step of the aimed movement, or wait for its result; False when it is finished."""
         c = self.config
         if self._aim is None:
             return False

@@ -13,7 +13,7 @@ PARALLEL = np.cos(np.radians(2.0))
 
 @dataclass(frozen=True)
 class PairCheck:
-    """One pair of parallel axes: ``text`` says what it senses and what it breaks, if anything."""
+    """Judges a pair of parallel axes: ``text`` says what it senses and which rule it breaks, if any."""
 
     first: int
     second: int
@@ -60,7 +60,7 @@ def check_pairs(placement: Placement) -> list[PairCheck]:
 
 
 def verdicts(placement: Placement) -> list[str]:
-    """What ``check_pairs`` found, a line a pair, or that there is no pair to judge."""
+    """Return the results of ``check_pairs``, a line per pair, or a line that says that there is no pair."""
     checks = check_pairs(placement)
     if not checks:
         return [f"{placement.name}: no two axes are parallel, so the propositions of Latt 2011 say nothing of it"]

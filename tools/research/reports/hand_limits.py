@@ -1,4 +1,4 @@
-"""What no instrument of this kind could better in one hand: the manipulator's stroke, and causal estimation."""
+"""Computes bounds for any instrument of this kind in a hand: the manipulator's stroke, and causal estimation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Swing:
 
 
 def strongest(truth: Mapping[str, Array], from_ns: int, to_ns: int) -> Swing:
-    """Of the hand alone (the manipulator resting), between two instants of the run."""
+    """Return the strongest swing of the hand alone (manipulator at rest) between two instants of the run."""
     t_ns = np.asarray(truth["t_ns"])
     moved = np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"])
     power = np.sum(band_pass(moved, RATE_HZ, TREMOR_BAND_HZ) ** 2, axis=1)

@@ -40,7 +40,7 @@ HANDS = (
 
 @dataclass(frozen=True)
 class HandRow:
-    """One hand, one estimator."""
+    """Holds the result of a hand with an estimator."""
 
     hand: str
     source: str
@@ -96,7 +96,7 @@ def run_hand(
     limits: tuple[float, float] | None = None,
     recorded_s: float = float("inf"),
 ) -> HandRow | None:
-    """One hand, one estimator (the bench's own, if none is named); None for a run too short to be scored.
+    """Run a hand with an estimator (default: the bench's own); None for a run too short to be scored.
 
     ``limits``: those of this hand, where they are known from another estimator's run.
     """
@@ -229,7 +229,7 @@ def markdown(
 
 
 def _played_again(rows: list[HandRow], seconds: float) -> list[str]:
-    """Which hands are shorter than a run, so that the estimator meets the same tremor more than once."""
+    """List the hands shorter than a run, for which the estimator meets the same tremor more than once."""
     short = {row.hand: row.recorded_s for row in rows if row.recorded_s < seconds}
     if not short:
         return []
@@ -239,11 +239,11 @@ def _played_again(rows: list[HandRow], seconds: float) -> list[str]:
 
 
 def explain_miss(row: HandRow) -> list[str]:
-    """What the figures say of a hand that misses the goal; nothing that they do not."""
+    """Explain a hand that misses the goal by the figures alone."""
     vector, swing = row.figures.vector, row.swing
-    said = [f"{row.hand[0].upper()}{row.hand[1:]}:"]
+    sentences = [f"{row.hand[0].upper()}{row.hand[1:]}:"]
     if swing.rms_um > 3.0 * swing.rest_um > 0.0:
-        said.append(
+        sentences.append(
             f"{100.0 * swing.share:.0f} % of the tremor's power is one swing from {swing.start_s:.0f} to "
             f"{swing.start_s + swing.seconds:.0f} s after the start, {swing.rms_um:.0f} um rms against "
             f"{swing.rest_um:.1f} um in all the rest: it decides the figure, and the estimator meets it unprepared "
@@ -251,8 +251,8 @@ def explain_miss(row: HandRow) -> list[str]:
         )
     elif swing.rest_um > 0.0:
         share = f"{100.0 * swing.share:.0f} % of the tremor's power"
-        said.append(f"its strongest {swing.seconds:g} s hold {share}: no single swing.")
+        sentences.append(f"its strongest {swing.seconds:g} s hold {share}: no single swing.")
     least = 100.0 * (1.0 - row.stroke_limit_um / vector.uncompensated_rms_um)
-    said.append(f"With the tremor known beforehand the stroke would allow {least:.1f} %;")
-    said.append(f"the manipulator is at a limit in {row.limited_percent:.1f} % of the ticks.")
-    return wrap(" ".join(said), 110)
+    sentences.append(f"With the tremor known beforehand the stroke would allow {least:.1f} %;")
+    sentences.append(f"the manipulator is at a limit in {row.limited_percent:.1f} % of the ticks.")
+    return wrap(" ".join(sentences), 110)

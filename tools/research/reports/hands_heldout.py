@@ -31,7 +31,7 @@ SUFFIXES = (".npz", ".csv", ".toml")
 
 @dataclass(frozen=True)
 class Source:
-    """One recording: ``address`` as ``load_hand`` takes it, its name in the table, its length."""
+    """Describes a recording: ``address`` as ``load_hand`` takes it, its name in the table, its length."""
 
     name: str
     address: str
@@ -152,7 +152,7 @@ def run_heldout(bench: BenchFile, folder: Folder, seconds: float, progress: Call
 
 
 def stroke_percent(row: HandRow) -> float:
-    """How much of the tremor the stroke alone would take away, the tremor known beforehand."""
+    """Return the share of the tremor that the stroke alone could remove with the tremor known beforehand."""
     return 100.0 * (1.0 - row.stroke_limit_um / row.figures.vector.uncompensated_rms_um)
 
 

@@ -137,8 +137,8 @@ def page() -> str:
     for kind, words in KINDS.items():
         lines += [f"### `{kind}`", ""]
         for role, patterns in (("inputs", words.inputs), ("outputs", words.outputs)):
-            said = ", ".join(f"`{_signals(p)}` ({' or '.join(units) or 'any unit'})" for p, units in patterns)
-            lines.append(f"- {role}: {said or 'any names, any units'}")
+            listed = ", ".join(f"`{_signals(p)}` ({' or '.join(units) or 'any unit'})" for p, units in patterns)
+            lines.append(f"- {role}: {listed or 'any names, any units'}")
         lines += ["", *_rows(keys.of_kind(kind)), ""]
     lines += [
         "Packages may add kinds ([a twin of your own](adding/twin.md)).",
@@ -153,7 +153,7 @@ def page() -> str:
 
 
 def written() -> str:
-    """What ``micron mismatch new`` writes for the data of the page."""
+    """Return the output of ``micron mismatch new`` for the data of the page."""
     source = re.findall(r"^``` \{ \.python[^\n]*\n(.*?)^```", _GUIDE, flags=re.S | re.M)[0]
     with tempfile.TemporaryDirectory() as name:
         before = Path.cwd()

@@ -71,13 +71,13 @@ def _pair(
     source: str, condition: str, kind: int, published: tuple[float, float], ours: tuple[float, float], unit: str
 ) -> list[Row]:
     rows = []
-    for quantity, theirs, mine in (("rms error", published[0], ours[0]), ("max error", published[1], ours[1])):
+    for quantity, reference, own in (("rms error", published[0], ours[0]), ("max error", published[1], ours[1])):
         name = f"{quantity}, {NAMES[kind]}"
         if kind == 0:
             # a condition on the emulation, not a result
-            rows.append(Row(source, name, unit, condition, theirs, mine, "higher", "emulated", why=UNCOMPENSATED))
+            rows.append(Row(source, name, unit, condition, reference, own, "higher", "emulated", why=UNCOMPENSATED))
         else:
-            rows.append(Row(source, name, unit, condition, theirs, mine, "lower", "emulated", why=WHY[kind]))
+            rows.append(Row(source, name, unit, condition, reference, own, "lower", "emulated", why=WHY[kind]))
     return rows
 
 
@@ -90,9 +90,9 @@ def table_7_1() -> list[Row]:
         for hz, found in results.items():
             rows += _pair(source, f"{hz:g} Hz, 12.5 um p-p, 5 s, 3 stacks", kind, TABLE_7_1[hz][column], found, "um")
         # erratum 81: the printed means 0.23, 0.18 are 0.22, 0.17
-        theirs = tuple(float(np.mean([TABLE_7_1[hz][column][i] for hz in FREQUENCIES_HZ])) for i in (0, 1))
+        reference = tuple(float(np.mean([TABLE_7_1[hz][column][i] for hz in FREQUENCIES_HZ])) for i in (0, 1))
         found = tuple(float(np.mean([results[hz][i] for hz in FREQUENCIES_HZ])) for i in (0, 1))
-        rows += _pair(source, "mean over 1 to 19 Hz", kind, (theirs[0], theirs[1]), (found[0], found[1]), "um")
+        rows += _pair(source, "mean over 1 to 19 Hz", kind, (reference[0], reference[1]), (found[0], found[1]), "um")
     return rows
 
 
@@ -160,7 +160,7 @@ def other_choices() -> list[str]:
 
 
 def table() -> Table:
-    """All rows."""
+    """Return the table of all rows."""
     from tools.research.reproduce.actuation_hand import missing_notes
     from tools.research.reproduce.actuation_manipulator import three_axes, workspace_rows
     from tools.research.reproduce.actuation_real import real_stack

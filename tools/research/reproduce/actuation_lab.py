@@ -69,9 +69,11 @@ class Controller:
 
 @dataclass(frozen=True)
 class Stand:
-    """One stack in the lab: ``late`` without a model, rate-independent and rate-dependent as in Ang 2004, without
-    preview; ``early`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and taps;
-    ``ours_late``: our model and no preview."""
+    """Holds the controllers of a stack in the lab.
+
+    ``late``: without a model, rate-independent and rate-dependent as in Ang 2004, without preview; ``early``: the same
+    three identified and driven with the lag of ``fit``; ``ours``: model, preview and taps; ``ours_late``: our model
+    and no preview."""
 
     fit: PiezoFit
     late: tuple[Controller, ...]
@@ -95,7 +97,7 @@ class Tracking:
 def recording(
     config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float, share: float = 1.0
 ) -> Recording:
-    """One recording of the lab, as ``micron calibrate piezo`` would load it."""
+    """Return a recording of the lab, as ``micron calibrate piezo`` would load it."""
     columns, _ = measure_piezo(config, axis, profile, rate_hz, seconds, share * SWING_V)
     n, dt = len(columns["command_V"]), 1.0 / sample_rate_hz(profile)
     return Recording(

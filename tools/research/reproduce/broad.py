@@ -54,21 +54,21 @@ def attitude(trial: Trial, setting: Record | None = None) -> np.ndarray:
 def rows() -> list[Row]:
     """The fixed setting beside its peers, trial by trial; then settings chosen without the trial."""
     every = trials()
-    theirs = [vqf_errors_deg(trial) for trial in every]
+    vqf_errors = [vqf_errors_deg(trial) for trial in every]
     fixed = [trial.errors_deg(attitude(trial)) for trial in every]
     found: list[Row] = []
-    for trial, ours, vqf in zip(every, fixed, theirs, strict=True):
+    for trial, ours, vqf in zip(every, fixed, vqf_errors, strict=True):
         found += _fixed(trial, ours, vqf)
-    found += _means(every, [errors[0] for errors in fixed], theirs, "one setting for all trials")
+    found += _means(every, [errors[0] for errors in fixed], vqf_errors, "one setting for all trials")
     for factor in FACTORS:
-        found += _chosen(every, theirs, factor)
+        found += _chosen(every, vqf_errors, factor)
     return found
 
 
 def rows_not_given() -> list[Row]:
     """The fixed setting on trials that no setting was chosen with (``trials_not_given``)."""
     every = trials_not_given(data_folder() / NOT_GIVEN)
-    theirs = [vqf_errors_deg(trial) for trial in every]
+    vqf_errors = [vqf_errors_deg(trial) for trial in every]
     ours = [trial.errors_deg(attitude(trial)) for trial in every]
     single = [
         Row(
@@ -82,17 +82,17 @@ def rows_not_given() -> list[Row]:
             "recording",
             why=f"{errors[0] / vqf[0]:.2f} x vqf",
         )
-        for trial, errors, vqf in zip(every, ours, theirs, strict=True)
+        for trial, errors, vqf in zip(every, ours, vqf_errors, strict=True)
         if vqf is not None
     ]
     totals = [errors[0] for errors in ours]
-    return [*_means(every, totals, theirs, "one setting", "not in view of the development"), *single]
+    return [*_means(every, totals, vqf_errors, "one setting", "not in view of the development"), *single]
 
 
 def _means(
     every: list[Trial],
     ours: list[float],
-    theirs: list[tuple[float, float, float] | None],
+    vqf_errors: list[tuple[float, float, float] | None],
     condition: str,
     view: str = "all in view of the development",
 ) -> list[Row]:
@@ -102,7 +102,7 @@ def _means(
         ("trials", GOAL_MEAN, [True] * len(every)),
         ("disturbed trials", GOAL_DISTURBED, [trial.disturbed for trial in every]),
     ):
-        peers = [vqf[0] for vqf, counts in zip(theirs, use, strict=True) if counts and vqf is not None]
+        peers = [vqf[0] for vqf, counts in zip(vqf_errors, use, strict=True) if counts and vqf is not None]
         if not peers or len(peers) < sum(use):
             continue
         mean = float(np.mean([error for error, counts in zip(ours, use, strict=True) if counts]))
@@ -172,14 +172,14 @@ def _best(trial: Trial) -> dict[str, float]:
     return {name: float(trial.published[key]) for name, key in keys.items() if key in trial.published}
 
 
-def _chosen(every: list[Trial], theirs: list[tuple[float, float, float] | None], factor: float) -> list[Row]:
+def _chosen(every: list[Trial], vqf_errors: list[tuple[float, float, float] | None], factor: float) -> list[Row]:
     """Leave one trial out: against the least of Madgwick's and Mahony's best and 1.1 x vqf."""
     if len(every) < 2:
         return []
     errors = np.array([[trial.errors_deg(attitude(trial, s))[0] for trial in every] for s in settings(factor)])
     unseen = [float(errors[chosen_without(errors, k), k]) for k in range(len(every))]
-    found = _means(every, unseen, theirs, f"setting chosen without the trial, within {factor:.2g}")
-    for trial, vqf, ours in zip(every, theirs, unseen, strict=True):
+    found = _means(every, unseen, vqf_errors, f"setting chosen without the trial, within {factor:.2g}")
+    for trial, vqf, ours in zip(every, vqf_errors, unseen, strict=True):
         limits = list(_best(trial).values())
         ratio = ""
         if vqf is not None:

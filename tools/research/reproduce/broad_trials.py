@@ -38,7 +38,7 @@ class Trial:
 
 
 def trials() -> list[Trial]:
-    """All trials that are there."""
+    """Return all trials that exist."""
     found = []
     for entry in meta("broad")["files"]:
         found.append(read_trial(data_folder() / "broad" / entry["name"], entry))
@@ -46,7 +46,7 @@ def trials() -> list[Trial]:
 
 
 def read_trial(path: Path, entry: dict[str, Any]) -> Trial:
-    """One file of the set; ``entry`` is what its meta.toml says of it."""
+    """Read a file of the set; ``entry`` is its entry in meta.toml."""
     with np.load(path) as data:
         rate, force, field, truth = (
             np.ascontiguousarray(np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64))

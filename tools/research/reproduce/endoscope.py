@@ -271,7 +271,7 @@ SECTIONS: Sequence[Section] = (settling, beta_sweep, broad, imus, mapping_tables
 
 
 def table() -> Table:
-    """All sections; recordings that are not there are left out with a note."""
+    """Return the table of all sections; missing recordings are left out with a note."""
     notes = [
         "clicks and rotations of six people (Figures 6.7 to 6.11) are bars without numbers: micron endoscope tables"
     ]

@@ -75,10 +75,10 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path 
             kept[s.name] = asdict(done)
             rows_file.parent.mkdir(parents=True, exist_ok=True)
             rows_file.write_text(json.dumps(kept, default=float))
-    shown = [found[s.name] for s in SETS if s.name in found and (not only or s in wanted)]
-    rows = tuple(row for done in shown for row in rows_of(done))
+    selected = [found[s.name] for s in SETS if s.name in found and (not only or s in wanted)]
+    rows = tuple(row for done in selected for row in rows_of(done))
     return Table(
-        "measured", rows, time.perf_counter() - begin, page=document(shown, read_page(before) if before else "")
+        "measured", rows, time.perf_counter() - begin, page=document(selected, read_page(before) if before else "")
     )
 
 

@@ -39,9 +39,9 @@ def document(found: Sequence[Scored], before: str = "") -> str:
     rows, sections = _parts(before)
     rows |= {f.name: _row(f) for f in found}
     sections |= {_SET[f.name].title: _section(f) for f in found}
-    shown = [s for s in SETS if s.name in rows]
+    listed = [s for s in SETS if s.name in rows]
     absent = [s.name for s in SETS if s.name not in rows]
-    met = [cells[8] for cells in (rows[s.name] for s in shown) if cells[8]]
+    met = [cells[8] for cells in (rows[s.name] for s in listed) if cells[8]]
     return "\n".join(
         [
             "# The mismatch tool on measured recordings",
@@ -52,13 +52,13 @@ def document(found: Sequence[Scored], before: str = "") -> str:
             " are those of the diagnosis, in one process on a shared machine.",
             "",
             *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
-            *([f"Run anew for this page: {', '.join(new)}.", ""] if len(new) < len(shown) else []),
+            *([f"Run anew for this page: {', '.join(new)}.", ""] if len(new) < len(listed) else []),
             "| set | unit | as given | re-fitted | with physics | noise (tool's) | published | goal | met |"
             " what it said | CPU s | tool |",
             "|---|---|---|---|---|---|---|---|---|---|---|---|",
-            *(f"| {' | '.join(rows[s.name])} |" for s in shown),
+            *(f"| {' | '.join(rows[s.name])} |" for s in listed),
             "",
-            *(line for s in shown for line in sections[s.title]),
+            *(line for s in listed for line in sections[s.title]),
         ]
     )
 
@@ -79,11 +79,11 @@ def _row(f: Scored) -> list[str]:
     s = _SET[f.name]
     goal = next((row for row in rows_of(f) if row.source.startswith("goal")), None)
     published = "; ".join(f"{p.figure:g} ({p.what})" for p in s.published) or "none"
-    said = f"{f.verdict}: {', '.join(f.named)}" if f.named else f.verdict
+    verdict = f"{f.verdict}: {', '.join(f.named)}" if f.named else f.verdict
     return [
         f.name, s.unit, *(_figure(v) for v in (f.given, f.refitted, f.corrected, f.floor)), published,
         "" if goal is None else f"{goal.published:.3g}", "" if goal is None else "yes" if goal.meets else "no",
-        said, f"{f.cpu_s:.0f}", f.revision[:8],
+        verdict, f"{f.cpu_s:.0f}", f.revision[:8],
     ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What one measured set gave, its rows for the contract, and what is left of it in words."""
+"""Compares the result of a measured set with its published rows, and describes the rest in words."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MeasuredRow(Row):
 
 @dataclass(frozen=True)
 class Scored:
-    """One set: the report on the fit part, and the residual rms on the sealed test in the unit of the set.
+    """Holds the result of a set: the report on the fit part, and the residual rms on the sealed test in its unit.
 
     ``left``: what the corrected twin's residual on the test follows, (signal, feature, share of variance).
     """
@@ -76,8 +76,8 @@ def rows_of(done: Scored) -> list[Row]:
         goal = s.goal.figure * (done.given or float("nan")) if s.goal.relative_to_given else s.goal.figure
         row = MeasuredRow("goal of the project", f"residual rms, {s.title}", condition=f"{where}; with the right names",
                           published=goal, ours=ours if meet else float("nan"), names_meet=meet, **common)  # fmt: skip
-        said = f"named {', '.join(done.named) or 'nothing'}" if not meet else ""
-        rows.append(row if row.meets else replace(row, why="; ".join(w for w in (said, why) if w)))
+        verdict = f"named {', '.join(done.named) or 'nothing'}" if not meet else ""
+        rows.append(row if row.meets else replace(row, why="; ".join(w for w in (verdict, why) if w)))
     return rows
 
 

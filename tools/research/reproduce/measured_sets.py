@@ -40,9 +40,11 @@ class Goal:
 
 @dataclass(frozen=True)
 class MeasuredSet:
-    """One official split. ``fit`` and ``test``: descriptor and sample range (None: all). ``initialization``: samples
-    at the start of the test that may set the state and are not scored. ``periods``: how often a test of one steady
-    period is run; the last is scored. ``test`` None: the tool's own held-out blocks of ``fit`` are the test.
+    """Describes an official split.
+
+    ``fit`` and ``test``: descriptor and sample range (None: all). ``initialization``: number of samples at the start of
+    the test that may set the state and are not scored. ``periods``: number of runs of a test of one steady period, of
+    which the last is scored. ``test`` None: the tool's own held-out blocks of ``fit`` are the test.
     """
 
     name: str

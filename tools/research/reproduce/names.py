@@ -1,4 +1,4 @@
-"""Which tables there are. Each name's module is loaded when it is asked for."""
+"""Lists the tables by name and loads the module of a name when it is requested."""
 
 from __future__ import annotations
 

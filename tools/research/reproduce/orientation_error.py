@@ -24,7 +24,7 @@ def product(p: Array, q: Array) -> Array:
 
 
 def east_north_up(quaternion: Array) -> Array:
-    """From a world with x to north to one with x to east: a turn of 90 degrees about up."""
+    """Rotate from a world with x to north to one with x to east: by 90 degrees about up."""
     half = np.sqrt(0.5)
     return product(np.tile([half, 0.0, 0.0, half], (len(quaternion), 1)), quaternion)
 

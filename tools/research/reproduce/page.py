@@ -17,7 +17,7 @@ KINDS = {
 
 
 def markdown(tables: Sequence[Table], command: str, revision: str) -> str:
-    """One section a table: the rows that are not met first, with their reasons, then all of them."""
+    """Return a section per table: the rows that are not met first, with their reasons, then all of them."""
     lines = ["# Published figures beside ours", "", f"Made by `{command}` at {revision}.", ""]
     for table in tables:
         missed = [row for row in table.rows if not row.meets]

@@ -251,12 +251,12 @@ def check() -> None:
 
 
 def table() -> Table:
-    """All sets that are there; ``InputError`` without any."""
+    """Return the table of all existing sets. Raises ``InputError`` without any."""
     check()
-    there = {name: section for name, section in SETS.items() if (data_folder() / name).is_dir()}
-    notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in there]
-    if "broad" in there and find_spec("vqf") is None:
+    existing = {name: section for name, section in SETS.items() if (data_folder() / name).is_dir()}
+    notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in existing]
+    if "broad" in existing and find_spec("vqf") is None:
         notes.append("the vqf package (development extra) is not installed: its rows are left out")
-    if all(name in there for name in ("imu_tk_xsens", "mpu6050_tomisuarez")):
-        there["gyroscopes"] = gyroscopes
-    return build("real-sensors", list(there.values()), notes)
+    if all(name in existing for name in ("imu_tk_xsens", "mpu6050_tomisuarez")):
+        existing["gyroscopes"] = gyroscopes
+    return build("real-sensors", list(existing.values()), notes)

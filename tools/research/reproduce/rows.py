@@ -1,4 +1,4 @@
-"""One published figure beside ours. ``meets`` is computed from the two, never typed."""
+"""Compares published figures with ours. ``meets`` is computed from both, never typed."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Row:
 
     @property
     def meets(self) -> bool:
-        """Whether ours is the published figure (``equal``) or at least as good; a figure that is missing never is."""
+        """Return True if ours equals the published figure (``equal``) or is as good; False if one is missing."""
         if not (math.isfinite(self.published) and math.isfinite(self.ours)):
             return False
         if self.better == "equal":
@@ -47,7 +47,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """What ``micron reproduce NAME`` prints; ``notes`` are conditions that hold for all rows, or what was skipped."""
+    """Holds the output of ``micron reproduce NAME``; ``notes`` are conditions of all rows, or omissions."""
 
     name: str
     rows: tuple[Row, ...]
@@ -66,7 +66,7 @@ class Table:
 
 
 def keys(rows: Sequence[Row]) -> list[str]:
-    """What names a row among its table's: source and quantity, and a number where both come again."""
+    """Return the key of each row in its table: source and quantity, and a number if both occur again."""
     found: list[str] = []
     count: dict[str, int] = {}
     for row in rows:

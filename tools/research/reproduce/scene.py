@@ -116,7 +116,7 @@ def run_scene(
     magnet_uT: Callable[[Array], Array] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SceneResult:
-    """One run of unit ``config.unit`` with noise ``config.seed``; every ``every``-th millisecond is kept.
+    """Run unit ``config.unit`` with noise ``config.seed`` and keep every ``every``-th millisecond.
 
     ``magnet_uT`` gives a field (n, 3), body axes, from times (n,) s. ``progress`` hears of the seconds done.
     """

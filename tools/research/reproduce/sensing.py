@@ -20,7 +20,7 @@ NOTES = (
 
 
 def table() -> Table:
-    """All rows."""
+    """Return the table of all rows."""
     sections = (
         sensing_variance.placement_tables,
         sensing_noise.optimised_placements,

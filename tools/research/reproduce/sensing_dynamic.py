@@ -293,15 +293,15 @@ def orientation_rows() -> list[Row]:
                 )
             )
         triad_tilt, triad_heading = triad_alone(result)
-        for name, ours, theirs in (("tilt", tilt, triad_tilt), ("heading", heading, triad_heading)):
+        for name, ours, reference in (("tilt", tilt, triad_tilt), ("heading", heading, triad_heading)):
             rows.append(
                 Row(
                     "Ang 2004, sec. 4.3.2",
                     f"{name}: rms of TRIAD alone over that of the filter",
                     "1",
-                    f"{condition}; TRIAD {rms(theirs[late]):.3f} deg",
+                    f"{condition}; TRIAD {rms(reference[late]):.3f} deg",
                     1.0,
-                    rms(theirs[late]) / rms(ours[late]),
+                    rms(reference[late]) / rms(ours[late]),
                     "higher",
                     "emulated",
                     why=WHY_HEADING if name == "heading" else "",

@@ -42,7 +42,7 @@ SAMPLES = 500
 
 @dataclass(frozen=True)
 class Calibrated:
-    """One emulated instrument with both of its calibrations."""
+    """Holds an emulated instrument with both of its calibrations."""
 
     config: EmulationConfig
     line: SensingConfig
@@ -89,7 +89,7 @@ def _towards(axis: Array) -> Array:
 
 @cache
 def calibrated(large: bool, unit: int) -> Calibrated:
-    """Both calibrations of one unit."""
+    """Return both calibrations of a unit."""
     config = _config(LARGE if large else DEFAULT, unit)
     places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
     common = {"positions_m": places, "gravity_m_s2": config.environment.gravity_m_s2}

@@ -103,7 +103,7 @@ def _limits(lines: Sequence[Summary], cases: Sequence[Case], kind: Kind, conditi
         ("trained on other hands", OTHERS, plain([b.others[ticks] for b in bounds])),
         ("trained on the record itself", ORACLE, plain([b.oracle[ticks] for b in bounds])),
     ):
-        for measure, ours, theirs in (
+        for measure, ours, reference in (
             (LIFTED, best.lifted_percent, _one(lines, limit, LOOP_MS).lifted_percent),
             ("plain 2-20 Hz, limit fitted so", best.all_percent, unlifted),
         ):
@@ -114,7 +114,7 @@ def _limits(lines: Sequence[Summary], cases: Sequence[Case], kind: Kind, conditi
                     "1",
                     f"{LOOP_MS} ms; {condition}",
                     1.15,
-                    ours / theirs,
+                    ours / reference,
                     "lower",
                     kind,
                     why="" if measure == LIFTED else "the method is asked to make 8 to 12 Hz small, not 2 to 20",
@@ -167,8 +167,8 @@ def _tasks() -> list[Row]:
     rows: list[Row] = []
     described = "3 records of 20 s made as described (the page's generator is not published)"
     mixed = TremorConfig(sees="displacement", filter_cutoff_rad_s=inf)
-    told = tuned(mixed, TUNED_MIXED["adaptive"])
-    second = left([published_case(2, s) for s in SEEDS], told, "adaptive", (0, 8, 20))
+    retuned = tuned(mixed, TUNED_MIXED["adaptive"])
+    second = left([published_case(2, s) for s in SEEDS], retuned, "adaptive", (0, 8, 20))
     published = ((0, 33.8, 20.0), (8, 34.9, 21.6), (20, 36.3, 21.9))
     for ours, (h, state_space, floor) in zip(second, published, strict=True):
         rows.append(

@@ -19,7 +19,7 @@ CONSTRAINTS = Path(__file__).parents[3] / "constraints.txt"
 
 
 class Finding(NamedTuple):
-    """One vulnerability of one package; ``repaired_in`` is empty when no version repairs it."""
+    """Describes a vulnerability of a package; ``repaired_in`` is empty when no version repairs it."""
 
     package: str
     version: str
@@ -28,7 +28,7 @@ class Finding(NamedTuple):
 
 
 def findings(report: Mapping[str, Any]) -> list[Finding]:
-    """From the JSON of pip-audit."""
+    """Return the findings in the JSON of pip-audit."""
     return [
         Finding(entry["name"], entry.get("version", "?"), problem["id"], tuple(problem.get("fix_versions", ())))
         for entry in report["dependencies"]
@@ -37,12 +37,12 @@ def findings(report: Mapping[str, Any]) -> list[Finding]:
 
 
 def audited(report: Mapping[str, Any]) -> int:
-    """How many packages the database had an answer for."""
+    """Return the number of packages that the database knows."""
     return sum("skip_reason" not in entry for entry in report["dependencies"])
 
 
 def verdict(found: Sequence[Finding]) -> int:
-    """What the audit ends with: 1 when there is something to do."""
+    """Return the exit status of the audit: 1 when there is something to do."""
     return int(any(finding.repaired_in for finding in found))
 
 

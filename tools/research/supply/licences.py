@@ -17,7 +17,7 @@ COPYLEFT = re.compile(r"\b(LGPL|GPL|AGPL|MPL|Lesser General|Mozilla|General Publ
 
 
 class Part(NamedTuple):
-    """One installed distribution. ``direct``: named in pyproject.toml; ``extra``: only for an optional extra."""
+    """Describes an installed distribution; ``direct``: in pyproject.toml; ``extra``: only for an optional extra."""
 
     name: str
     version: str
@@ -52,7 +52,7 @@ def licence_of(distribution: Distribution) -> str:
 
 
 def parts(found: Iterable[Distribution], named: Mapping[str, str]) -> list[Part]:
-    """All distributions by name, our own left out; ``named`` as ``declared`` gives it."""
+    """Return all distributions by name without our own; ``named`` is the result of ``declared``."""
     rows: dict[str, Part] = {}
     for d in found:
         name = d.metadata["Name"]
