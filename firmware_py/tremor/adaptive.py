@@ -175,7 +175,8 @@ def adaptive_params(config: TremorConfig) -> Records[AdaptiveParams]:
 
 def _shares(config: TremorConfig) -> Array:
     """(3, 3): axes tell each other the less, the less alike their noise is."""
-    noise = np.ones(AXES) if config.lever is None else np.diag(np.array(config.lever.noise))[:AXES]
+    lever = config.lever
+    noise = np.ones(AXES) if lever is None else np.square([lever.tip_noise(axis) for axis in range(AXES)])
     alike = np.minimum.outer(noise, noise) / np.maximum.outer(noise, noise)
     return config.adaptive.share * alike * (1.0 - np.eye(AXES)) + np.eye(AXES)
 

@@ -141,13 +141,17 @@ def motion_in_channels(config: TremorConfig) -> Array:
     share = config.adaptive.lever_share
     if config.lever is None:
         return np.ones((1, 1))
-    return np.array([[1.0, share, 0.0], [share, share, 0.0], [0.0, 0.0, share]])
+    channels = np.array([[1.0, share, 0.0], [share, share, 0.0], [0.0, 0.0, share]])
+    return channels if config.lever.noise else channels[:2, :2]
 
 
 def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
     """(C, C): covariance of the channels' noise for noise of the tip of unit variance."""
     if config.lever is None:
         return np.ones((1, 1))
+    if config.lever.noise is None:
+        turning = (config.lever.noise_m_s2_rtHz[axis] / config.lever.tip_noise_m_s2_rtHz[axis]) ** 2
+        return np.array([[1.0, turning], [turning, turning]])
     signals = lever_signals(config.lever)[axis]
     noise = signals @ np.array(config.lever.noise) @ signals.T
     return np.asarray(noise / noise[0, 0])
@@ -182,8 +186,8 @@ class Lean:
 def lean_of(config: TremorConfig) -> Lean:
     """Return zeros without a lever."""
     lever = config.lever
-    if lever is None:
-        return Lean(np.zeros((AXES, 1, 3)), np.zeros((AXES, 3, 3)))
+    if lever is None or lever.noise is None:
+        return Lean(np.zeros((AXES, 2 if lever else 1, 3)), np.zeros((AXES, 3, 3)))
     noise, signals = np.array(lever.noise), lever_signals(lever)
     # e_k x alpha along axis i: (3, 3, 6) by i, k
     carried = np.zeros((AXES, 3, 6))
@@ -207,13 +211,8 @@ def sensor_noise(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
     if config.sees == "displacement":
         return np.full(len(hz), a.reading_noise_m**2 * per_sample)
     low_pass = np.abs(sensor_response(config, hz) / (2.0 * pi * hz) ** 2) ** 2
-    density = a.sensor_noise_m_s2_rtHz**2 if config.lever is None else config.lever.noise[axis][axis]
+    density = (a.sensor_noise_m_s2_rtHz if config.lever is None else config.lever.tip_noise(axis)) ** 2
     return np.asarray(low_pass * density + a.reading_noise_m_s2**2 * per_sample)
-
-
-def noise_densities(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
-    """(C, C, f): cross-spectral densities of the channels' noise."""
-    return np.asarray(noise_in_channels(config, axis)[:, :, None] * sensor_noise(config, hz, axis))
 
 
 def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
@@ -227,8 +226,9 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
     hz = np.arange(a.cancel_to_hz[1], 0.5 * config.tick_hz, 0.5)
     above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
     features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
-    density = a.quiet * above * noise_densities(config, hz, axis) * np.maximum(1.0, shaking_power(config, hz))
-    return _noise_covariance(features, density, 0.5)
+    density = a.quiet * above * sensor_noise(config, hz, axis) * np.maximum(1.0, shaking_power(config, hz))
+    of_tip = np.real((features * density) @ features.conj().T) * 0.5
+    return np.asarray(np.kron(noise_in_channels(config, axis), of_tip), dtype=np.float64)
 
 
 def shaking_power(config: TremorConfig, hz: Array) -> Array:
@@ -381,19 +381,19 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
 
     def of_axis(axis: int) -> dict[str, Any]:
         """Return what the sensor's noise along ``axis`` has a part in."""
-        noise = noise_densities(config, s.hz, axis)
+        noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
         quiet = _penalty_above_band(config, bank, axis)
-        rest = plain_rest + _noise_covariance(plain, noise)
+        rest = plain_rest + _covariance(plain, noise, noisy)
         sums = [part + rest + quiet for part in tremor]
-        gate = np.sum((s.rest + (noise[0, 0] - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
+        gate = np.sum((s.rest + (noise - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
         return {
             "gate_power": a.gate_ratio * gate,
-            "rest": phi_rest + _noise_covariance(phi, noise),
+            "rest": phi_rest + _covariance(phi, noise, noisy),
             "quiet": quiet,
-            "noise_cross": np.stack([_noise_cross(phi, noise[:, 0] * weight * t) for t in target]),
-            "noise_power": np.sum(noise[0, 0] * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
+            "noise_cross": np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]),
+            "noise_power": np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
             "start": np.stack([solve_scaled(m, r) for m, r in zip(sums, plain_cross, strict=True)]),
-            "onward": solve_scaled(sums[0], next_motion + np.stack([_noise_cross(plain, row * z) for row in noise])),
+            "onward": solve_scaled(sums[0], next_motion + np.stack([_cross(plain, noise * z, row) for row in noisy])),
         }
 
     first = of_axis(0)
@@ -446,14 +446,14 @@ def _core_design(
     phi = plain * weight
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
     moved = _covariance(phi, s.rest - s.noise, moving)
-    noises = [noise_densities(config, s.hz, axis) for axis in range(AXES)]
+    noises = [(sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)) for axis in range(AXES)]
     lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
     return CoreDesign(
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         tremor=np.stack(
             [_covariance(phi, np.abs(s.seen) ** 2 * t, moving) / u for t, u in zip(s.tremor, unit, strict=True)]
         ),
-        rest=np.stack([moved + _noise_covariance(phi, noise) for noise in noises]),
+        rest=np.stack([moved + _covariance(phi, noise, noisy) for noise, noisy in noises]),
         cross=np.stack(
             [
                 np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
@@ -461,11 +461,11 @@ def _core_design(
             ]
         ),
         noise_cross=np.stack(
-            [np.stack([_noise_cross(phi, noise[:, 0] * weight * t) for t in target]) for noise in noises]
+            [np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]) for noise, noisy in noises]
         ),
         lean_cross=lean_cross,
         lean_power=lean_power,
-        noise_power=np.array([np.sum(n[0, 0] * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for n in noises]),
+        noise_power=np.array([np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for noise, _ in noises]),
         weighted_power=np.array([a.tremor_rms_m**2, a.burst_rms_m**2]) * unit,
         least_power=a.least_rms_m**2 * float(unit[0]),
     )
@@ -490,16 +490,6 @@ def _lean_noise(
 def _covariance(features: Complex, density: Array, channels: Array) -> Array:
     of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
     return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
-
-
-def _noise_covariance(features: Complex, noise: Array, step_hz: float = GRID_STEP_HZ) -> Array:
-    """(m, m): of all channels' features, for noise of densities (C, C, f)."""
-    return np.block([[np.real((features * each) @ features.conj().T) * step_hz for each in row] for row in noise])
-
-
-def _noise_cross(features: Complex, densities: Complex | Array) -> Array:
-    """(m,): features of all channels with a signal that has the cross-densities (C, f) with them."""
-    return np.concatenate([np.real(np.conj(features) @ each) * GRID_STEP_HZ for each in densities])
 
 
 def _cross(features: Complex, density: Complex | Array, channel: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from math import inf
+from math import inf, sqrt
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, cast
 
@@ -239,12 +239,21 @@ class LeverConfig(_Table):
 
     arm_m: tuple[float, float, float]
     """From the quiet point to the tip, body frame."""
-    noise: tuple[_Row, _Row, _Row, _Row, _Row, _Row]
+    noise: tuple[_Row, _Row, _Row, _Row, _Row, _Row] | None = None
     """One-sided densities: of the tip's specific force (m/s^2), then of the angular acceleration (rad/s^2)."""
+    noise_m_s2_rtHz: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
+    """In place of ``noise`` in recordings of versions that did not see the turn about the arm: of angular acceleration
+    times arm, along each axis."""
+    tip_noise_m_s2_rtHz: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
+    """The same of the tip."""
     gravity_m_s2: Positive = STANDARD_GRAVITY
     lean_from_hz: Positive = 0.3
     """Above it the attitude is the double integral of the angular acceleration, so gravity carries that noise into the
     tip's acceleration."""
+
+    def tip_noise(self, axis: int) -> float:
+        """Return the noise of the tip's acceleration along ``axis``, m/s^2/sqrt(Hz)."""
+        return self.tip_noise_m_s2_rtHz[axis] if self.noise is None else sqrt(self.noise[axis][axis])
 
 
 class TremorConfig(_Table):

@@ -12,7 +12,7 @@ from firmware_py.control.plan import load_plan
 from firmware_py.frame import ANGULAR_ACCELERATION, LAYOUT, TICK, TIP_ACCELERATION, TREMOR_AHEAD
 from firmware_py.sensing.attitude_params import tip_lever
 from firmware_py.sensing.config import SensingConfig
-from firmware_py.tremor.adaptive_design import design_adaptive, lever_signals
+from firmware_py.tremor.adaptive_design import design_adaptive, lever_signals, noise_in_channels
 from firmware_py.tremor.config import LeverConfig, TremorConfig
 from firmware_py.tremor.estimator import Estimator
 from firmware_py.tremor.stage import Tremor
@@ -210,3 +210,18 @@ def test_a_solved_filter_is_eased_in() -> None:
         np.testing.assert_allclose(
             np.array(state.filter[0]), used + share * (np.array(state.solved[0]) - used), rtol=1e-9
         )
+
+
+def test_a_recording_of_a_version_without_the_turn_about_the_arm_has_the_two_channels_of_then() -> None:
+    old = {
+        "arm_m": (0.0, 0.0, ARM_M),
+        "noise_m_s2_rtHz": (TURN, TURN, 0.0),
+        "tip_noise_m_s2_rtHz": (2 * TURN, 1.0, 1.0),
+    }
+    design = design_adaptive(TremorConfig(lever=LeverConfig.model_validate(old)))
+    assert design.bank.channels == 2
+    assert not design.lean.by_up.any()
+    assert not design.lean.by_square.any()
+    np.testing.assert_allclose(
+        noise_in_channels(TremorConfig(lever=LeverConfig.model_validate(old))), [[1.0, 0.25], [0.25, 0.25]]
+    )
