@@ -31,12 +31,14 @@ ROOMS = (
     "tools/reports",
     "tools/research/cli",
     "tools/research/endoscope",
+    "tools/research/faults",
     "tools/research/manipulator",
     "tools/research/placement",
     "tools/research/reports",
     "tools/research/reproduce",
     "tools/research/results",
     "tools/research/supply",
+    "tools/research/tremor",
 )
 WITHOUT_SUBJECT = re.compile(r"(Of|What|Whether|So|How|Where|Which|Whose|When|From|As|At|For|Not|All|Both|Its|One) ")
 """A docstring that begins so is a fragment: it needs the text before it, or leaves out the verb."""

@@ -1,4 +1,4 @@
-"""All faults, at all operating points, with all seeds; then one row per fault and point."""
+"""Runs all faults at all operating points with all seeds; returns a row per fault and point."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WITHIN_MS = 20.0  # from the moment at which the tip has gone 5 um astray
 
 @dataclass(frozen=True)
 class FaultRow:
-    """One fault at one operating point, in all phases, over all seeds."""
+    """Holds the results of a fault at an operating point, in all phases, over all seeds."""
 
     fault: Fault
     point: str
@@ -81,14 +81,14 @@ class FaultRow:
 
     @property
     def wrong_messages(self) -> int:
-        """How many trips, holds and refusals have a message that names none of the words that belong to the fault."""
+        """Count the trips, holds and refusals whose message contains none of the words of the fault."""
         return sum(self.is_misnamed(o) for o in self.observations)
 
     def is_misnamed(self, o: Observation) -> bool:
         """The message of ``o`` names none of the words that belong to the fault."""
         # a self-test that still waits when its run is ended has not said anything yet
-        told = o.answer in TOLD and not o.held_on and not o.message.startswith(ENDED_WELL)
-        return told and not any(word.lower() in o.message.lower() for word in self.fault.names)
+        is_reported = o.answer in TOLD and not o.held_on and not o.message.startswith(ENDED_WELL)
+        return is_reported and not any(word.lower() in o.message.lower() for word in self.fault.names)
 
     @property
     def is_good(self) -> bool:
@@ -99,15 +99,15 @@ class FaultRow:
     @property
     def known_by(self) -> str:
         """Return what said so first, in the words most often used (numbers left out); empty: nothing."""
-        said = [NUMBERS.sub("#", o.known_by) for o in self.observations if o.known_by]
-        return max(sorted(set(said)), key=said.count) if said else ""
+        messages = [NUMBERS.sub("#", o.known_by) for o in self.observations if o.known_by]
+        return max(sorted(set(messages)), key=messages.count) if messages else ""
 
     @property
     def isolated(self) -> int:
         """Runs in which what was said names the part that is broken."""
         parts = (self.fault.part,) if self.fault.part else self.fault.names
-        said = [f"{o.known_by} {o.message}".lower() for o in self.observations if o.known_by]
-        return sum(any(part.lower() in text for part in parts) for text in said)
+        messages = [f"{o.known_by} {o.message}".lower() for o in self.observations if o.known_by]
+        return sum(any(part.lower() in text for part in parts) for text in messages)
 
     def as_dict(self) -> dict[str, Any]:
         """Row of the contract's JSON, and what else is known. Times and distances are those of outputs that work."""
@@ -236,7 +236,7 @@ def run_campaign(
 
 @dataclass(frozen=True)
 class Trial:
-    """One hand, one seed, one phase (``None``: before the devices are opened) and the faults that strike there."""
+    """Names a hand, a seed, a phase (``None``: before the devices are opened) and the faults that strike there."""
 
     bench: Path
     point: str

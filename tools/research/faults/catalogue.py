@@ -22,7 +22,7 @@ GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral aft
 
 
 def faults() -> tuple[Fault, ...]:
-    """All of them, in the order of the table."""
+    """Return all faults, in the order of the table."""
     rooms = (serial_line, daq_device, sensors, output_bus, magnetometer, can_bus, actuators, host)
     return tuple(fault for room in rooms for fault in room())
 
@@ -79,7 +79,7 @@ def sensors() -> tuple[Fault, ...]:
     def plain(
         name: str, fault: str, target: str, expected: Expected, names: tuple[str, ...] = (), why: str = ""
     ) -> Fault:
-        """Of the two inputs that are axes where there are eight."""
+        """Return a fault of an input that is an axis only in the layout with eight axes."""
         return Fault(f"sensor: {name}", InWorld(fault, target), expected, names, why=why, redundant="noticed")
 
     noise = (

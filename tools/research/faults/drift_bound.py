@@ -1,4 +1,4 @@
-"""How slow a drift of one accelerometer axis any detector can miss: the Neyman-Pearson bound in the hand's own motion.
+"""Computes the slowest drift of an accelerometer axis that a detector can see: a bound by Neyman and Pearson.
 
 Six axes and six unknowns leave no parity (erratum 15): a drift can be told from motion only by what is known of the
 motion. Given to the detector for nothing: the spectra of hand and noise (a vector autoregression of a healthy run), the
@@ -66,7 +66,7 @@ def whitener(readings_V: Array) -> Whitener:
 
 
 def seen(d: float, windows_per_hour: float) -> float:
-    """How often a drift with ``d`` is seen at ``FALSE_PER_HOUR`` false alarms, one decision per window."""
+    """Return the probability to see a drift with ``d`` at ``FALSE_PER_HOUR`` false alarms, one decision per window."""
     return float(norm.cdf(d - norm.isf(FALSE_PER_HOUR / windows_per_hour)))
 
 
@@ -101,7 +101,7 @@ def drift_bound(bench: Path, point: str, rate_V_per_s: float, moved_ms: float, a
 
 
 def drift_bounds(bench: Path, rows: Sequence[FaultRow]) -> list[DriftBound]:
-    """For each drift and hand of a campaign on ``bench``, from the median time that it took to 5 um."""
+    """Return bounds for each drift and hand of a campaign on ``bench``, from the median time to 5 um."""
     bounds: list[DriftBound] = []
     with tempfile.TemporaryDirectory(prefix="micron-drift-") as folder:
         for row in rows:

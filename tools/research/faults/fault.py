@@ -1,4 +1,4 @@
-"""One fault: what is done, where, and what a good answer to it is."""
+"""Defines a fault: the disturbance, its place, and the correct response."""
 
 from __future__ import annotations
 

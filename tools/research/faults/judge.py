@@ -1,4 +1,4 @@
-"""What one run with a fault says: when it was seen, what was done, what it cost."""
+"""Judges a run with a fault: the detection, the response, and its cost."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ ENDED_WELL = ("run finished", "stopped by the operator")
 
 @dataclass(frozen=True)
 class Seen:
-    """From both sides of one run: outcome of the firmware; path of the tip, demands at the amplifier (t_ns, channel,
-    volts) and scans taken from the world; whether a fault that strikes at random did. ``wire_ns``: longest time from
-    a command's way into the port until it is a demand, where nobody waits for it."""
+    """Holds the records of both sides of a run.
+
+    They are the outcome of the firmware; the path of the tip, demands at the amplifier (t_ns, channel, volts) and scans
+    taken from the world; and if a fault that strikes at random did. ``wire_ns``: longest time from a command's way into
+    the port until it is a demand, if it is not waited for."""
 
     strike_ns: int
     outcome: dict[str, Any]
@@ -103,7 +105,7 @@ class Observation:
 
     @property
     def detect_ms(self) -> float | None:
-        """When anything was known of the fault."""
+        """Return the time of the first sign of the fault."""
         times = [t for t in (self.tripped_ms, self.held_ms, self.noticed_ms) if t is not None]
         return min(times) if times else None
 
@@ -187,8 +189,8 @@ def driven_in_hold(demands: list[tuple[int, int, float]], begin_ns: float, end_n
 
 
 def neutral_ms(demands: list[tuple[int, int, float]], decided_ns: int, until_ns: int | None = None) -> float | None:
-    """From the decision until the last change of a demand before ``until_ns``; ``None`` when one is not neutral
-    then."""
+    """Return the time from the decision to the last change of a demand before ``until_ns``; ``None`` if one is not
+    neutral then."""
     last_ns = decided_ns
     volts_of: dict[int, float] = {}
     for t_ns, channel, volts in demands:

@@ -21,11 +21,11 @@ all frequencies (8 to 12 Hz alone: `micron run`). `tests/hil/test_time_marks.py`
 
 
 def block(run: LongRun, command: str, revision: str) -> str:
-    """One run as Markdown."""
+    """Return a run as Markdown."""
     columns = ["eighth", "left um", "tremor um", "left %", "memory MB"]
     rows = [
-        [f"{k + 1}", f"{left:.2f}", f"{there:.2f}", f"{100 * left / there:.1f}" if there else "-", f"{memory:.2f}"]
-        for k, (left, there, memory) in enumerate(zip(run.left_um, run.tremor_um, run.memory_MB, strict=True))
+        [f"{k + 1}", f"{left:.2f}", f"{tremor:.2f}", f"{100 * left / tremor:.1f}" if tremor else "-", f"{memory:.2f}"]
+        for k, (left, tremor, memory) in enumerate(zip(run.left_um, run.tremor_um, run.memory_MB, strict=True))
     ]
     if run.tilt_mrad is not None:
         columns.append("tilt error mrad")

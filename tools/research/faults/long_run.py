@@ -55,13 +55,13 @@ class LongRun:
 
     @property
     def growth_MB(self) -> float:
-        """From the end of the first eighth, when everything has been used once."""
+        """Return the growth from the end of the first eighth, when everything has been used once."""
         return max(self.memory_MB) - self.memory_MB[0]
 
     @property
     def drift(self) -> float:
         """Largest departure of the part that is left from its median, relative to it."""
-        part = [left / there for left, there in zip(self.left_um, self.tremor_um, strict=True) if there > 0.0]
+        part = [left / tremor for left, tremor in zip(self.left_um, self.tremor_um, strict=True) if tremor > 0.0]
         middle = float(np.median(part)) if part else 1.0
         return max((abs(p - middle) / middle for p in part), default=0.0)
 
@@ -72,7 +72,7 @@ class LongRun:
             found.append(f"memory grew by {self.growth_MB:.1f} MB")
         if self.drift > DRIFT:
             found.append(f"what is left of the tremor varied by {100 * self.drift:.0f} %")
-        if empty := sum(there == 0.0 for there in self.tremor_um):
+        if empty := sum(tremor == 0.0 for tremor in self.tremor_um):
             found.append(f"nothing was seen in {empty} of {EIGHTHS} eighths")
         if self.ended != "run finished":
             found.append(f"it ended with: {self.ended}")
@@ -99,7 +99,7 @@ MUST_BE_ZERO = (
 
 
 def resident_MB() -> float:
-    """Of this process, after the allocator has given back what is free (its holes come and go by megabytes)."""
+    """Return the memory of this process after the allocator has released free memory, which comes in megabytes."""
     with contextlib.suppress(AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -158,19 +158,21 @@ def _unexpected(rows: Sequence[FaultRow]) -> list[str]:
 def _unseen(rows: Sequence[FaultRow]) -> list[str]:
     lines: list[str] = []
     for name in dict.fromkeys(row.fault.name for row in rows):
-        mine = [row for row in rows if row.fault.name == name]
-        late, unsafe = sum(row.late for row in mine), sum(o.rough for row in mine for o in row.observations)
-        blind = not mine[0].fault.is_told_in_time
+        own_rows = [row for row in rows if row.fault.name == name]
+        late, unsafe = sum(row.late for row in own_rows), sum(o.rough for row in own_rows for o in row.observations)
+        blind = not own_rows[0].fault.is_told_in_time
         if not (late or blind or unsafe):
             continue
-        runs = sum(row.seeds for row in mine)
-        detected = sum(row.detected for row in mine)
-        worst_um = max(o.astray_um for row in mine for o in row.observations)
-        slow = " (slow)" if mine[0].fault.slow else ""
+        runs = sum(row.seeds for row in own_rows)
+        detected = sum(row.detected for row in own_rows)
+        worst_um = max(o.astray_um for row in own_rows for o in row.observations)
+        slow = " (slow)" if own_rows[0].fault.slow else ""
         text = f"- **{name}**{slow}: known in {detected} of {runs} runs, in {late} later than 20 ms after 5 um; "
         text += f"tip error up to {worst_um:.0f} um"
-        text += f"; {unsafe} {'jumps of its own' if mine[0].fault.own_output else 'unsafe demands'}" if unsafe else ""
-        lines.append(text + (f". {mine[0].fault.why}." if mine[0].fault.why else "."))
+        text += (
+            f"; {unsafe} {'jumps of its own' if own_rows[0].fault.own_output else 'unsafe demands'}" if unsafe else ""
+        )
+        lines.append(text + (f". {own_rows[0].fault.why}." if own_rows[0].fault.why else "."))
     return lines
 
 
@@ -200,16 +202,16 @@ THEN = {
 def _matrix(rows: Sequence[FaultRow]) -> list[str]:
     lines: list[str] = []
     for name in dict.fromkeys(row.fault.name for row in rows):
-        mine = [row for row in rows if row.fault.name == name]
-        said = next((row.known_by for row in mine if row.known_by), "-")
-        told = sum(1 for row in mine for o in row.observations if o.known_by)
-        named = f"{sum(row.isolated for row in mine)} of {told}" if told else "-"
-        answers = [row.answer for row in mine]
+        own_rows = [row for row in rows if row.fault.name == name]
+        first_message = next((row.known_by for row in own_rows if row.known_by), "-")
+        reported = sum(1 for row in own_rows for o in row.observations if o.known_by)
+        named = f"{sum(row.isolated for row in own_rows)} of {reported}" if reported else "-"
+        answers = [row.answer for row in own_rows]
         then = THEN[max(sorted(set(answers)), key=answers.count)]
-        if any(not o.confirmed for row in mine for o in row.observations):
+        if any(not o.confirmed for row in own_rows for o in row.observations):
             then = "latched: switch the amplifier off"
-        lost = max(o.lost for row in mine for o in row.observations)
-        lines.append(f"| {name} | {_short(said)} | {named} | {then} | {lost} |")
+        lost = max(o.lost for row in own_rows for o in row.observations)
+        lines.append(f"| {name} | {_short(first_message)} | {named} | {then} | {lost} |")
     return lines
 
 

@@ -32,7 +32,7 @@ class Phase:
     longer_s: float = 0.0
 
     def instants_ns(self, seed: int) -> tuple[int, int]:
-        """When the prelude and the fault strike: the same for all faults of one seed."""
+        """Return the instants of the prelude and of the fault: the same for all faults of a seed."""
         begin, later = np.random.default_rng([seed, *self.name.encode()]).random(2)
         begin_s = self.from_s + (self.to_s - self.from_s) * float(begin)
         return round(begin_s * 1e9), round((begin_s + self.within_s * float(later)) * 1e9)

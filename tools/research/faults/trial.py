@@ -1,4 +1,4 @@
-"""One hand, one seed, every fault: a run in virtual time that forks at the instant of the strike.
+"""Runs a hand and a seed with every fault: a run in virtual time that forks at the instant of the strike.
 
 The way to the strike is the same for all faults, bit for bit, so it is gone once; then a child process per fault
 breaks something and goes on to the end of its own run. The first child breaks nothing: it is the reference. Faults that
@@ -221,8 +221,8 @@ def observe_running(
     except BaseException as error:
         if me.is_child:
             refuses = phase.name == SELF_TEST.name and isinstance(error, (HalError, MemoryError))
-            told = f"not enough memory: {error}" if isinstance(error, MemoryError) else str(error)
-            me.answer(Refused(told) if refuses else error)
+            reason = f"not enough memory: {error}" if isinstance(error, MemoryError) else str(error)
+            me.answer(Refused(reason) if refuses else error)
         raise
     else:
         if not me.is_child:

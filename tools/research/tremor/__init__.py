@@ -1,4 +1,4 @@
-"""What real hands do, and what the estimators make of it.
+"""Analyses the tremor of real hands, and how well the estimators follow it.
 
 What lives here: evaluation, limits, training, pages. What must not: estimators (``firmware_py.tremor``).
 """

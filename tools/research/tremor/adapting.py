@@ -1,4 +1,4 @@
-"""How fast an estimator knows a new hand: the same stretch of a record, met after more or less time with that hand."""
+"""Measures how fast an estimator learns a new hand: a stretch of a record is scored after more or less time."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def merged(table: Table, changes: Table) -> dict[str, Any]:
 
 
 def _inline(value: Any) -> str:
-    """One TOML value on one line. JSON writes everything but tables as TOML does."""
+    """Write a TOML value on one line. JSON writes everything but tables as TOML does."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(k))} = {_inline(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list | tuple):

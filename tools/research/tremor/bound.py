@@ -29,7 +29,7 @@ SKIP_S = 5.0  # a new hand: adaptation is over
 
 @dataclass(frozen=True)
 class _Sums:
-    """Of one axis at one horizon; the first axis counts the seconds."""
+    """Holds sums of an axis at a horizon; the first axis counts the seconds."""
 
     matrix: Array  # (s, m, m)
     right: Array  # (s, m)

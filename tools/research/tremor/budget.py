@@ -1,4 +1,4 @@
-"""What each source of error costs at the tip: the closed loop on the emulated instrument with one source taken away.
+"""Measures the cost of each error source at the tip: the closed loop is run with one source removed.
 
 Sources that a calibration file describes are taken away together with that file, the firmware told the part as it is:
 their cost is what calibration leaves. Costs are rms um in 8 to 12 Hz on the physical truth; cost = sqrt(with^2 -
@@ -87,7 +87,7 @@ class BudgetRow:
 
 
 def budget(bench: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[BudgetRow]:
-    """One run without wires per source; the first row is the instrument as it is."""
+    """Run the bench in virtual time for each source; the first row is the instrument as it is."""
     whole = math.nan
     with tempfile.TemporaryDirectory(prefix="micron-budget-") as folder:
         for n, (source, changes) in enumerate(sources(bench).items()):

@@ -45,7 +45,7 @@ class Subject:
 
 
 def subjects(signals: list[TremorSignal], making: Making) -> list[Subject]:
-    """One per person with a gyroscope recording: the calmest ``files`` stretches of 16 s, not overlapping.
+    """Return the subjects, one per person with a gyroscope recording: the calmest ``files`` separate stretches of 16 s.
 
     The one of median size comes first: it is what networks are trained on. The angle along the axis
     that trembles most, scaled to metres.
@@ -78,8 +78,8 @@ def voluntary(making: Making, seed: int) -> Array:
 
 
 def learning_paths(errors: list[Array], making: Making, motions: int, seed: int = 1000) -> tuple[Paths, Paths]:
-    """What a network learns from and what its size is chosen on: the first three quarters of every error file with each
-    of ``motions`` voluntary motions, and the last quarter with as many others. Testing uses other seeds."""
+    """Return training and validation paths: the first three quarters of every error file with each of ``motions``
+    voluntary motions, and the last quarter with as many others. Testing uses other seeds."""
     fit: list[tuple[Array, Array]] = []
     hold: list[tuple[Array, Array]] = []
     for n in range(motions):

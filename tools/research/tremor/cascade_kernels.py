@@ -102,7 +102,7 @@ def ndekf_pass(
     noise: float,
     growth: float,
 ) -> float:
-    """One pass of node-decoupled extended Kalman filtering over the samples ``order``; mean squared innovation.
+    """Make a pass of node-decoupled extended Kalman filtering over the samples ``order``; mean squared innovation.
 
     ``features`` (n, m): bias, window, hidden units that are frozen, newest unit last (recomputed here when ``unit`` has
     weights). Two groups, the weights into the output node and those into the newest hidden node, with covariances

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Training:
-    """How a network is trained. ``window`` inputs ``spacing`` samples apart, at most ``units`` hidden units.
+    """Holds the settings of training: ``window`` inputs ``spacing`` samples apart, at most ``units`` hidden units.
 
     ``spread``: standard deviation of the weights before training, of inputs and target of unit power. ``noise``:
     variance of what no network can explain, same unit. ``refine`` trains a new unit's input weights with the output's.
@@ -52,7 +52,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Paths:
-    """What a network learns from: pairs of (measured, voluntary), each (n,) in m."""
+    """Holds the paths that a network learns: pairs of (measured, voluntary), each (n,) in m."""
 
     pairs: tuple[tuple[Array, Array], ...]
 

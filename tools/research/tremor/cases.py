@@ -59,7 +59,7 @@ class Case:
 
 
 def case_of(signal: TremorSignal, seed: int = 0, scale: bool = True, noise: bool = True) -> Case:
-    """One recorded signal as a case. Raises InputError when it is no motion (pixels) or holds nothing."""
+    """Make a case of a recorded signal. Raises InputError when it is no motion (pixels) or holds nothing."""
     if signal.quantity not in ("acceleration", "angular rate", "displacement"):
         raise InputError(
             f"{signal.name}: {signal.quantity} in {signal.unit} is no motion of a hand; choose another signal"
@@ -135,7 +135,7 @@ def cases_from(source: str, scale: bool = True, noise: bool = True) -> list[Case
 
 
 def case_of_run(path: Path) -> Case:
-    """What an instrument saw in a run: tip acceleration as recorded; its own band, RC filter undone, is the truth."""
+    """Make a case of a run's recorded tip acceleration; its own band, RC filter undone, is the truth."""
     from firmware_py.recording.reader import Recording
 
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""What a recording's sampling clock really does, from known frequencies; time stamps: ``hal.even_samples``."""
+"""Measures a recording's sampling clock by known frequencies; time stamps: ``hal.even_samples``."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class ClockEstimate:
 
     @property
     def off_percent(self) -> float:
-        """How far the true rate is above the stated one."""
+        """Return the excess of the true rate over the stated one, in percent."""
         return 100.0 * (self.rate_hz / self.stated_hz - 1.0)
 
     def sentence(self) -> str:
-        """For people."""
+        """Describe the clock for people."""
         found = (
             f"sampling rate from {self.recordings} known frequencies: {self.rate_hz:.2f} Hz "
             f"({self.low_hz:.2f} to {self.high_hz:.2f})"

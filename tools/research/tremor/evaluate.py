@@ -25,7 +25,7 @@ HORIZONS_MS = (0, 2, 8, 20)
 
 @dataclass(frozen=True)
 class Result:
-    """One method, case and horizon. ``frequency_error_hz``: median over the scored part, axis with the most tremor."""
+    """Holds a method, case and horizon; ``frequency_error_hz``: median of the scored part, axis with most tremor."""
 
     group: str
     case: str
@@ -68,7 +68,7 @@ def evaluate(
     config: TremorConfig | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Result]:
-    """All results; the limits are computed per group of cases that see the same."""
+    """Return all results; the limits are computed per group of cases with the same data."""
     base = config or TremorConfig()
     results: list[Result] = []
     groups: dict[tuple[str, str], list[Case]] = {}
@@ -126,7 +126,7 @@ class Summary:
 
 
 def summarise(results: Sequence[Result]) -> list[Summary]:
-    """One line per group, method and horizon, in the order of the results."""
+    """Return a line per group, method and horizon, in the order of the results."""
     table: dict[tuple[str, str, int], list[Result]] = {}
     for r in results:
         table.setdefault((r.group, r.method, r.horizon_ms), []).append(r)

@@ -76,7 +76,7 @@ class IdealRow:
 
 
 def ideal_changes(noise: bool) -> dict[str, Any]:
-    """What makes a bench ideal, for ``write_variant``."""
+    """Return the changes that make a bench ideal, for ``write_variant``."""
     emulation: dict[str, Any] = dict(PERFECT_EMULATION)
     # the bound pays nothing for what its filter passes above the band, so neither does the filter beside it
     adaptive: dict[str, Any] = {"quiet": 0.0}
@@ -94,7 +94,7 @@ def ideal_changes(noise: bool) -> dict[str, Any]:
 
 
 def ideal_run(bench: Path, seconds: float, noise: bool, seed: int | None = None) -> IdealRow:
-    """One run without wires on the ideal instrument and its bound. Raises ValueError when nothing is left to score."""
+    """Run the ideal instrument in virtual time, with its bound. Raises ValueError when nothing is left to score."""
     with tempfile.TemporaryDirectory(prefix="micron-ideal-") as folder:
         file = write_variant(bench, ideal_changes(noise), Path(folder), "ideal")
         run = simulate(load_bench(file), seconds, seed=seed)
@@ -167,7 +167,7 @@ def _samples(truth: Mapping[str, Array], noise: bool) -> Array:
 
 
 def _alone(samples: Array, wanted: Array, noise: bool) -> Array:
-    """What the estimator leaves as the ideal bench configures it, at the bound's horizon in whole ticks."""
+    """Return the rest of the estimator as the ideal bench configures it, at the bound's horizon in whole ticks."""
     ticks = ceil(LOOP_DELAY_S * RATE_HZ)
     table = {**ideal_changes(noise)["firmware"]["tremor"], "loop_delay_s": ticks / RATE_HZ}
     ahead = Estimator(TremorConfig.model_validate(table)).run(samples).ahead_m

@@ -1,4 +1,4 @@
-"""What a recording holds: spectrum over time, peak frequency with its interval, amplitude, harmonics, tremor or not.
+"""Describes a recording: spectrum over time, peak frequency with interval, amplitude, harmonics, tremor or not.
 
 The recording is cut into windows of 4 s. A window's spectrum is averaged over 2 s segments that overlap by half; its
 peak is the highest local maximum in the tremor band, refined on the window's own periodogram. A window holds tremor
@@ -37,7 +37,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Window:
-    """One window. ``amplitude``: of a sine with the peak's power (per axis, root of the sum), in the signal's unit.
+    """Describes a window. ``amplitude``: of a sine with the peak's power (root sum over axes), in the signal's unit.
 
     ``share``: of the power in ``Rule.whole_hz`` that lies around the peak. ``harmonics``: amplitude at 2 and 3 times
     the peak over that at the peak, nan above the recording's band. nan throughout where the band holds no peak.
@@ -79,18 +79,18 @@ class Inspection:
 
     @property
     def steady(self) -> bool:
-        """Whether the windows agree on a peak: an interval of at most 2 Hz."""
+        """Return True if the windows agree on a peak: an interval of at most 2 Hz."""
         return bool(self.high_hz - self.low_hz <= 2.0)
 
     def sentence(self) -> str:
-        """For people."""
+        """Describe the result for people."""
         held = f"{100.0 * self.tremor_share:.0f} % of {len(self.windows)} windows hold tremor"
         if not self.steady:
             return f"{held}; the windows do not agree on a peak"
         return f"{held}; peak {self.peak_hz:.2f} Hz (95 %: {self.low_hz:.2f} to {self.high_hz:.2f})"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: everything but the samples and the spectrum."""
+        """Return everything but the samples and the spectrum for JSON."""
         signal = self.signal
         return {
             "name": signal.name,

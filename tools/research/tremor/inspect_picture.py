@@ -23,13 +23,13 @@ def inspection_figure(found: Inspection) -> Any:
     signal, rule = found.signal, found.rule
     pieces = segments(signal.values, signal.rate_hz, rule.segment_s)
     spectra = [periodogram(p, signal.rate_hz) for p in pieces[:: max(1, len(pieces) // 1500)]]
-    shown = spectra[0].frequency_hz <= SHOWN_HZ
-    level_dB = 10.0 * np.log10(np.maximum(np.array([s.density[shown] for s in spectra]).T, 1e-300))
+    in_range = spectra[0].frequency_hz <= SHOWN_HZ
+    level_dB = 10.0 * np.log10(np.maximum(np.array([s.density[in_range] for s in spectra]).T, 1e-300))
     top = float(np.percentile(level_dB, 99.8))
     figure = Figure(figsize=(9.0, 6.5), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, height_ratios=(2, 1))
-    span = (signal.start_s, signal.start_s + signal.seconds, 0.0, float(spectra[0].frequency_hz[shown][-1]))
+    span = (signal.start_s, signal.start_s + signal.seconds, 0.0, float(spectra[0].frequency_hz[in_range][-1]))
     image = upper.imshow(level_dB, origin="lower", aspect="auto", extent=span, cmap="magma", vmin=top - 60.0, vmax=top)
     figure.colorbar(image, ax=upper, label=f"dB re 1 ({signal.unit})$^2$/Hz", pad=0.01)
     middle = np.array([w.start_s + 0.5 * rule.window_s for w in found.windows])
@@ -58,7 +58,7 @@ def png_bytes(figure: Any) -> bytes:
 
 
 def page(found: list[Inspection]) -> str:
-    """One self-contained HTML page."""
+    """Return a self-contained HTML page."""
     parts = [
         "<!doctype html><html lang=en><meta charset=utf-8><title>Tremor inspection</title>",
         "<style>body{font:15px sans-serif;max-width:70em;margin:2em auto;padding:0 1em}img{max-width:100%}"

@@ -1,4 +1,4 @@
-"""How a method behaves when things change: onset, frequency jump, growing bias (Ang 2004, 5.2.2), on steady tones.
+"""Tests methods on changes: onset, frequency jump, growing bias (Ang 2004, 5.2.2), on steady tones.
 
 Each figure is a time (s) until what is left, rms over 0.25 s, stays below ``SETTLED`` of the tone; nan: never.
 """
@@ -68,7 +68,7 @@ def manners(methods: Sequence[Method], config: TremorConfig | None = None) -> li
 
 
 def _left(config: TremorConfig, unit_path: Array, bias: Array) -> tuple[Array, float]:
-    """What is left of a path of ``SIZE_M`` (n,), and the last frequency."""
+    """Return the rest of a path of ``SIZE_M`` (n,), and the last frequency."""
     path = SIZE_M * unit_path
     acceleration = np.gradient(np.gradient(path)) * RATE_HZ**2 + bias
     keep = np.exp(-config.filter_cutoff_rad_s / RATE_HZ)

@@ -1,4 +1,4 @@
-"""What an estimator made of one case, in figures: how much is left, in which band, how late."""
+"""Scores an estimator on a case: how much is left, in which band, how late."""
 
 from __future__ import annotations
 
@@ -77,6 +77,6 @@ def _slow_percent(case: Case, ahead: Array, keep: slice) -> float:
     """Regression of the estimate on the voluntary path below 1 Hz; nan where that path is not known."""
     if case.slow is None:
         return float("nan")
-    path, taken = (low_pass(x, VOLUNTARY_HZ)[keep] for x in (case.slow, ahead))
-    path, taken = path - path.mean(axis=0), taken - taken.mean(axis=0)
-    return float(100.0 * abs(np.sum(path * taken)) / np.sum(path**2))
+    path, predicted = (low_pass(x, VOLUNTARY_HZ)[keep] for x in (case.slow, ahead))
+    path, predicted = path - path.mean(axis=0), predicted - predicted.mean(axis=0)
+    return float(100.0 * abs(np.sum(path * predicted)) / np.sum(path**2))

@@ -55,7 +55,7 @@ class Wrist:
 
 
 def shaker_figures(signals: list[TremorSignal]) -> Shaker:
-    """All driven recordings; each one's clock rate comes from the set as a whole (one number for 44 recordings)."""
+    """Return all driven recordings; each one's clock rate comes from the set as a whole (one number for 44)."""
     error: dict[str, list[float]] = {"low": [], "med": [], "high": []}
     covered: list[bool] = []
     stated = 0.0
@@ -83,14 +83,14 @@ def wrist_figures(signal: TremorSignal) -> tuple[Wrist, Inspection]:
     truth = reference.tremor[:n]
     share = np.array([w.share for w in found.windows[:n]])
     peak = np.array([w.peak_hz for w in found.windows[:n]])
-    said = np.array([w.tremor for w in found.windows[:n]])
+    detected = np.array([w.tremor for w in found.windows[:n]])
     held = _held_out(share, truth)
     ranked = np.sort(share[truth])[::-1]
     low = float(np.quantile(share[~truth], 0.9))
     return (
         Wrist(
-            float(np.mean(said[truth])),
-            float(np.mean(~said[~truth])),
+            float(np.mean(detected[truth])),
+            float(np.mean(~detected[~truth])),
             float(np.mean(held[truth])),
             float(np.mean(~held[~truth])),
             n,
@@ -103,8 +103,8 @@ def wrist_figures(signal: TremorSignal) -> tuple[Wrist, Inspection]:
 
 
 def _held_out(share: Array, truth: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What a limit says that was chosen on the other nine tenths (largest sum of sensitivity and specificity)."""
-    said = np.zeros(len(share), dtype=bool)
+    """Return decisions by limits that were chosen on the other nine tenths (sensitivity plus specificity)."""
+    detected = np.zeros(len(share), dtype=bool)
     for part in np.array_split(np.arange(len(share)), FOLDS):
         rest = np.setdiff1d(np.arange(len(share)), part)
         s, t = share[rest], truth[rest]
@@ -114,5 +114,5 @@ def _held_out(share: Array, truth: NDArray[np.bool_]) -> NDArray[np.bool_]:
         # the middle of the gap below the best limit: any value in it does the same on these windows
         at = int(best[0])
         limit = 0.5 * (limits[at] + limits[at - 1]) if at > 0 else limits[at]
-        said[part] = share[part] >= limit
-    return said
+        detected[part] = share[part] >= limit
+    return detected

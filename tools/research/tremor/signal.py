@@ -26,7 +26,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Reference:
-    """What is known beside the signal itself; absent knowledge is ``None``."""
+    """Holds the known facts beside the signal itself; an unknown one is ``None``."""
 
     drive_hz: float | None = None
     amplitude: str = ""  # low, med, high of a shaker
@@ -65,7 +65,7 @@ class TremorSignal:
         return self.start_s + np.arange(len(self.values)) / self.rate_hz
 
     def part(self, start_s: float, stop_s: float) -> TremorSignal:
-        """From ``start_s`` to ``stop_s`` after its own beginning; reference windows stay as they are."""
+        """Return the part from ``start_s`` to ``stop_s`` after its own beginning; reference windows are kept."""
         first, last = round(start_s * self.rate_hz), round(stop_s * self.rate_hz)
         if not 0 <= first < last <= len(self.values):
             raise InputError(f"{self.name}: part {start_s:g}:{stop_s:g} s, but it is {self.seconds:.2f} s long")

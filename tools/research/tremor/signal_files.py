@@ -23,7 +23,7 @@ _TIMES = ("t_s", "time_s")
 
 
 def read_file(path: Path) -> Iterator[TremorSignal]:
-    """One signal per quantity in the file: acceleration, angular rate, displacement. Raises InputError."""
+    """Read a signal per quantity in the file: acceleration, angular rate, displacement. Raises InputError."""
     if path.is_dir() and (path / "recording.toml").is_file():
         path = path / "recording.toml"
     if path.is_dir():

@@ -24,7 +24,7 @@ SHORTEST_S = 4.0
 
 
 def load_signals(source: str | Path) -> list[TremorSignal]:
-    """All signals of ``source``. Raises InputError: what, where, what to do."""
+    """Load all signals of ``source``. Raises InputError: what, where, what to do."""
     path, name, part = _address(str(source))
     signals = list(_read(path))
     if name:

@@ -28,7 +28,7 @@ class Spectrum:
         return float(self.frequency_hz[1])
 
     def inside(self, band_hz: tuple[float, float]) -> NDArray[np.bool_]:
-        """Where the grid lies in ``band_hz``, ends included."""
+        """Return the mask of the grid in ``band_hz``, ends included."""
         return (self.frequency_hz >= band_hz[0]) & (self.frequency_hz <= band_hz[1])
 
     def power(self, band_hz: tuple[float, float]) -> float:
