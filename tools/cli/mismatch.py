@@ -223,7 +223,7 @@ def new(
                 raise InputError(f"{option} {hertz:g}: must be a number of samples per second")
         from tools.mismatch.new import new_recording
 
-        made = new_recording(data, out, twin, rate, resample, cut, force)
+        made = new_recording(data, out, twin, rate_hz=rate, resample_hz=resample, cut=cut, force=force)
         _show_new(made, json_file)
 
 

@@ -63,8 +63,9 @@ def cut(
         raise InputError(f"{path}: neither 'rate_hz' nor 'time_column'; give one of them")
     begins = text.get("segments")
     written, kept = cut_columns(
-        data, t, {c: columns[c] for c in names}, begins if isinstance(begins, list) else [], (start_s, stop_s), every
-    )
+        data, t, {c: columns[c] for c in names}, begins if isinstance(begins, list) else [], (start_s, stop_s),
+        every=every,
+    )  # fmt: skip
     _write(path, text, out, written, kept.rate_hz, list(kept.segments))
     return kept
 
@@ -75,6 +76,7 @@ def cut_columns(
     columns: Mapping[str, Array],
     begins: Sequence[int] = (),
     span_s: tuple[float | None, float | None] = (None, None),
+    *,
     every: bool = False,
     rate_hz: float | None = None,
 ) -> tuple[dict[str, Array], Stretch]:

@@ -66,6 +66,7 @@ def new_recording(
     data: Path,
     out: Path | None = None,
     kind: str = "",
+    *,
     rate_hz: float | None = None,
     resample_hz: float | None = None,
     cut: bool = False,

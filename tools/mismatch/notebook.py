@@ -123,6 +123,7 @@ class Recording:
         inputs: Columns,
         outputs: Columns,
         context: Columns = (),
+        *,
         time: str | None = None,
         rate_hz: float | None = None,
         units: Mapping[str, str] | None = None,

@@ -130,7 +130,7 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     if twin.static and effect.kind == "add" and not outputs:
         return []  # nothing tells what is added in front of a gain from what is added behind it
     if twin.static:
-        return together + _static(twin, effect, stage, usable, inputs, outputs, bool(present))
+        return together + _static(twin, effect, stage, usable, inputs=inputs, outputs=outputs, present=bool(present))
     found: list[Placed] = together
     if outputs:
         # behind a plant with states only what does not commute with it tells its place: it sits at the sensor
@@ -146,7 +146,7 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
 
 
 def _static(
-    twin: Twin, effect: Effect, stage: Stage, usable: tuple[str, ...], inputs: bool, outputs: bool, present: bool
+    twin: Twin, effect: Effect, stage: Stage, usable: tuple[str, ...], *, inputs: bool, outputs: bool, present: bool
 ) -> list[Placed]:
     found: list[Placed] = []
     note = SAME if inputs and outputs else ""

@@ -71,7 +71,7 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
         out.append(th)
     if flows:
         return out
-    out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x, residual, ctx), *out]
+    out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x=x, residual=residual, ctx=ctx), *out]
     if not twin.static:
         # the re-fitted base may compensate the effect, so the engineer's own base is a start as well
         given = twin.start(view.recording)
@@ -103,7 +103,7 @@ MOST_BACK = 0.7
 
 
 def bent_back(
-    model: Model, k: int, theta: Array, guesses: Sequence[Array], x: Array, residual: Array, ctx: Context
+    model: Model, k: int, theta: Array, guesses: Sequence[Array], *, x: Array, residual: Array, ctx: Context
 ) -> list[Array]:
     """Return starts at the guesses of effect ``k`` with the base at its optimum beside the effect, to first order.
 

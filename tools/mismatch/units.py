@@ -33,7 +33,7 @@ class Unit:
     offset: float = 0.0
 
 
-def _d(m: int = 0, kg: int = 0, s: int = 0, a: int = 0, k: int = 0, rad: int = 0, count: int = 0) -> Dimension:
+def _d(*, m: int = 0, kg: int = 0, s: int = 0, a: int = 0, k: int = 0, rad: int = 0, count: int = 0) -> Dimension:
     return (m, kg, s, a, k, rad, count)
 
 

@@ -105,14 +105,14 @@ def follow(reference: Reference, state: State, residual: Array) -> tuple[State, 
         total = np.logaddexp.reduce(log_m, axis=1)
         for i in np.flatnonzero(total >= limit).tolist():
             at_s = first_s + (k + 1) * block_s
-            alarms.append(_alarm(reference, i, cusum[i], at_s, block, since[i], sums[i]))
+            alarms.append(_alarm(reference, i, cusum[i], at_s=at_s, block=block, since=since[i], sums=sums[i]))
             log_m[i], cusum[i], sums[i], since[i] = -np.inf, 0.0, 0.0, block + 1
     kept = data[figures.shape[0] * reference.block :]
     return State(kept, samples, state.blocks + figures.shape[0], log_m, cusum, since, sums), alarms
 
 
 def _alarm(
-    reference: Reference, i: int, cusum: Array, at_s: float, block: int, since: NDArray[np.int64], sums: Array
+    reference: Reference, i: int, cusum: Array, *, at_s: float, block: int, since: NDArray[np.int64], sums: Array
 ) -> Alarm:
     counts = np.maximum(block + 1 - since, 1)
     # clipped figures are alike: among the members with the evidence, the one that moved most names the change
