@@ -29,6 +29,7 @@ ROOMS = (
     "tools/mismatch",
     "tools/noise",
     "tools/reports",
+    "tools/start",
     "tools/research/cli",
     "tools/research/endoscope",
     "tools/research/faults",

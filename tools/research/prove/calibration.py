@@ -28,7 +28,7 @@ LEAST_CASES = 15
 
 
 def traits_file(folder: Path, samples: int) -> Path:
-    """Where the traits of searches with the present sources are kept."""
+    """Return the file with the traits of searches by the present sources."""
     digest = f"{digest_of(*SEARCHING)[:12]}-{generator_digest()[:12]}"
     return folder / f"traits-{samples}-{digest}.jsonl"
 

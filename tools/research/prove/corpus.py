@@ -67,7 +67,7 @@ def first_block(corpus: Corpus, revision: str) -> int:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One case on disk: ``recording`` (the descriptor), ``answer``, and the folder of what was sealed of it."""
+    """Holds a case on disk: ``recording`` (the descriptor), ``answer``, and the folder of its sealed part."""
 
     case: str
     recording: Path

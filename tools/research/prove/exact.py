@@ -37,26 +37,26 @@ EDGES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0 + 1e-9)
 
 
 def score_exactly(answer: Row, report: Row) -> dict[str, Any]:
-    """One row: what was true, what was said, and every exact score of it."""
+    """Return a row with the truth, the answer, and every exact score of it."""
     kind = str(answer["kind"])
     verdict = str(report.get("verdict", "error"))
     true = list(dict.fromkeys(str(t["name"]) for t in answer["effects"] if t["name"] != "unknown"))
-    said = list(dict.fromkeys(names_of(report)))
+    named = list(dict.fromkeys(names_of(report)))
     groups = [set(map(str, g.get("names", []))) for g in report.get("equivalent") or []]
     verdict_right = verdict == EXPECTED[kind]
-    set_right = verdict_right and set(said) == set(true)
+    set_right = verdict_right and set(named) == set(true)
     if kind == "unknown":
         set_right = verdict_right  # names beside an "unexplained" are counted as false ones, below
-    false = [n for n in said if n not in true]
+    false = [n for n in named if n not in true]
     wrong = not set_right
     return {
         "kind": kind, "twin": str(answer["twin"]), "twin_kind": KINDS.get(str(answer["twin"]), "other"),
         "severity": answer["severity"], "excitation": answer["excitation"], "noise_kind": answer["noise_kind"],
-        "form": [t["form"] for t in answer["effects"]], "true": true, "said": said, "verdict": verdict,
+        "form": [t["form"] for t in answer["effects"]], "true": true, "said": named, "verdict": verdict,
         "verdict_right": verdict_right,
-        "first_right": bool(said) and said[0] in true if true else None,
+        "first_right": bool(named) and named[0] in true if true else None,
         "set_right": set_right,
-        "grouped_right": verdict_right and _grouped(true, said, groups) if true else set_right,
+        "grouped_right": verdict_right and _grouped(true, named, groups) if true else set_right,
         "group_sizes": [len(g) for g in groups],
         "false_names": len(false),
         "flagged": wrong and verdict == "unexplained",
@@ -67,15 +67,15 @@ def score_exactly(answer: Row, report: Row) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _grouped(true: Sequence[str], said: Sequence[str], groups: Sequence[set[str]]) -> bool:
-    """Whether the names that were said are the true ones up to equivalences that the report states."""
-    if len(true) != len(said):
+def _grouped(true: Sequence[str], named: Sequence[str], groups: Sequence[set[str]]) -> bool:
+    """Return True if the reported names are the true ones up to equivalences that the report states."""
+    if len(true) != len(named):
         return False
 
     def same(a: str, b: str) -> bool:
         return a == b or any(a in g and b in g for g in groups)
 
-    return any(all(same(a, b) for a, b in zip(true, order, strict=True)) for order in permutations(said))
+    return any(all(same(a, b) for a, b in zip(true, order, strict=True)) for order in permutations(named))
 
 
 def _surenesses(report: Row, true: Sequence[str]) -> list[list[float]]:
@@ -150,7 +150,7 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def compare_paired(old: Sequence[Row], new: Sequence[Row]) -> dict[str, Any]:
-    """Both engines on the cases that both have: per score [both right, old alone, new alone, neither]."""
+    """Compare both engines on their common cases: per score [both right, old alone, new alone, neither]."""
     by_case = {r["case"]: r for r in old}
     both = [(by_case[r["case"]], r) for r in new if r["case"] in by_case]
     scores: dict[str, Callable[[Row], bool]] = {

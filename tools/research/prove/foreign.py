@@ -84,7 +84,7 @@ def judged(variant: str, report: Report) -> str:
 
 
 def diagnosed(recording: Path, variant: str, twin: str) -> Row:
-    """One row of the table. What the engine raises is in the row, too."""
+    """Return a row of the table, which also records an exception of the engine."""
     began = time.process_time()
     row: Row = {"variant": variant, "twin": twin}
     try:

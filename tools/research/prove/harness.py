@@ -23,9 +23,9 @@ SOURCES = (*SHARED, "tools/mismatch/infer")
 
 @dataclass(frozen=True)
 class Run:
-    """What is run: ``cases`` of a corpus from number ``first`` on, at ``max_samples``.
+    """Describes a run: ``cases`` of a corpus from number ``first`` on, at ``max_samples``.
 
-    ``minutes``: no case is begun after these.
+    No case starts after ``minutes``.
     """
 
     corpus: Name
@@ -91,7 +91,7 @@ def _scored(job: _Job, folder: Path, case: str) -> dict[str, Any]:
 
 
 def _essence(report: dict[str, Any]) -> dict[str, Any]:
-    """What a score reads of a report, kept so that a change of the scores costs no diagnosis."""
+    """Return the parts of a report that scores use, kept so that a change of the scores costs no diagnosis."""
     kept = {k: report[k] for k in ("verdict", "meaning", "equivalent", "seconds", "error") if k in report}
     kept["physics"] = [
         {k: p[k] for k in ("name", "output", "confidence", "parameters")} for p in report.get("physics") or []
@@ -129,13 +129,13 @@ def run_corpus(
     numbers = range(run.first, run.first + run.cases)
     left = [n for n in numbers if f"c{n:05d}" not in done]
     until = time.monotonic() + 60.0 * run.minutes
-    begun: Iterator[int] = (n for n in left if time.monotonic() < until)
+    in_time: Iterator[int] = (n for n in left if time.monotonic() < until)
     if run.jobs > 1:
         # processes take their work at once, so the time is looked at once per round
         rounds = [left[i : i + 4 * run.jobs] for i in range(0, len(left), 4 * run.jobs)]
         chunks = (chunk for chunk in rounds if time.monotonic() < until)
     else:
-        chunks = ([n] for n in begun)
+        chunks = ([n] for n in in_time)
     with file.open("a") as rows:
         for chunk in chunks:
             work = [_Job(corpus, n, start, folder, run.max_samples, call) for n in chunk]
@@ -146,8 +146,8 @@ def run_corpus(
                 progress(f"{len(done)} rows  {row['case']}  {row.get('cpu_s', 0.0):.1f} s of CPU")
     wanted = [done[c] for n in numbers if (c := f"c{n:05d}") in done]
     scored = [{k: v for k, v in r.items() if k != "report"} for r in wanted if not r.get("left_out")]
-    shown = tuple(scored) if corpus.open else ()
-    return Result(run, shown, summarise(scored), len(wanted) - len(scored), run.cases - len(wanted), digest)
+    open_rows = tuple(scored) if corpus.open else ()
+    return Result(run, open_rows, summarise(scored), len(wanted) - len(scored), run.cases - len(wanted), digest)
 
 
 def read_rows(file: Path, digest: str | None = None) -> list[dict[str, Any]]:

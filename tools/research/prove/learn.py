@@ -47,10 +47,11 @@ SETS = 60
 
 @dataclass(frozen=True)
 class SetTraits:
-    """What a decision reads of one set of names.
+    """Holds the figures of a set of names that a decision uses.
 
-    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken``
-    are those of ``worst_left`` (None: not looked at); ``events`` the p-values of those that were found beside it.
+    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and
+    ``explained`` are those of ``worst_left`` (None: not computed); ``events`` has the p-values of events found beside
+    the set.
     """
 
     names: frozenset[str]
@@ -58,29 +59,29 @@ class SetTraits:
     parameters: float
     z: float | None
     rest: float | None
-    taken: float | None
+    explained: float | None
     events: Mapping[str, float] = field(default_factory=dict[str, float])
 
     def with_events(self, c: Constants) -> frozenset[str]:
-        """The names that a report of this set has."""
+        """Return the names that a report of this set has."""
         return self.names | {n for n, p in self.events.items() if z_of_p(p) > c.least_z}
 
     def score(self, c: Constants, held: int) -> float:
-        """As ``Scored.score``."""
+        """Return the score as ``Scored.score`` does."""
         return min(c.samples, held) * self.density - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
 def traits_of(inferred: Inferred) -> dict[str, Any]:
-    """What a decision reads of a search, as plain JSON."""
+    """Return the figures of a search that a decision uses, as plain JSON."""
     store = inferred.found.store
     weakest = {s.key: z for s, z in tested(store) if s.names}
     ranked = store.ranked()  # tests may have fitted sets anew
     leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
     events: dict[frozenset[tuple[str, ...]], dict[str, float]] = {}
     for s in [*ranked[:LOOKED_AT], store.base]:
-        said = store.with_events(s)
-        rest = rest_of(store.problem, said.fitted)
-        leaves[s.key] = worst_left(store.problem, store.base.fitted, rest, doubt=bool(said.placed))
+        eventful = store.with_events(s)
+        rest = rest_of(store.problem, eventful.fitted)
+        leaves[s.key] = worst_left(store.problem, store.base.fitted, rest, doubt=bool(eventful.placed))
         events[s.key] = store.eventful[s.key][1]
     strange = free_curve(store.problem, store.base.fitted, candidate_signals(inferred.found.first))
     kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
@@ -119,17 +120,17 @@ def sets_of(traits: Traits) -> list[SetTraits]:
     out: list[SetTraits] = []
     for s in traits["sets"]:
         names = frozenset(s["names"])
-        rest, taken = left.get(names, (None, None))
+        rest, explained = left.get(names, (None, None))
         beside = events.get(names, {})
         out.append(
-            SetTraits(names, float(s["density"]), float(s["parameters"]), passed.get(names), rest, taken, beside)
+            SetTraits(names, float(s["density"]), float(s["parameters"]), passed.get(names), rest, explained, beside)
         )
     return out
 
 
 @dataclass(frozen=True)
 class Case:
-    """One search with its answer: the true ``names`` and the true ``verdict`` up to recalibration."""
+    """Holds a search with its answer: the true ``names`` and the true ``verdict`` up to recalibration."""
 
     case: str
     kind: str
@@ -172,28 +173,28 @@ class Case:
             if empty.score(c, self.held) + gain - c.per_name - c.per_parameter * CURVE > chosen.score(c, self.held):
                 return "unexplained", empty
         rest = chosen.rest if chosen.rest is not None else 0.0
-        if not is_whole(rest, chosen.taken or 0.0, c):
+        if not is_whole(rest, chosen.explained or 0.0, c):
             return "unexplained", chosen
         return ("named" if chosen.with_events(c) else "nothing"), chosen
 
     def right(self, c: Constants) -> bool:
-        """Whether verdict (up to recalibration) and set are exact."""
-        said, chosen = self.says(c)
+        """Return True if verdict (up to recalibration) and set are exact."""
+        verdict, chosen = self.says(c)
         if self.kind == "unknown":
-            return said == "unexplained"
-        return said == ("named" if self.names else "nothing") and chosen.with_events(c) == self.names
+            return verdict == "unexplained"
+        return verdict == ("named" if self.names else "nothing") and chosen.with_events(c) == self.names
 
     def log_probability(self, c: Constants) -> float:
         """Log probability of the true set among those of the search, clipped."""
         ranked = self.ranked(c)
         values = np.array([s.score(c, self.held) for s in ranked])
-        mine = [
+        own_scores = [
             v for s, v in zip(ranked, values, strict=True) if s.names | (self.names & s.events.keys()) == self.names
         ]
-        if not mine:
+        if not own_scores:
             return CLIP
         top = float(values.max())
-        return max(float(mine[0] - top - np.log(np.sum(np.exp(values - top)))), CLIP)
+        return max(float(own_scores[0] - top - np.log(np.sum(np.exp(values - top)))), CLIP)
 
 
 def learn(cases: Sequence[Case]) -> Constants:
@@ -268,8 +269,8 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
     """Every name that would be reported, with its probability before the map."""
     c = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
     for case in cases:
-        said, chosen = case.says(c)
-        whole = said != "unexplained"
+        verdict, chosen = case.says(c)
+        whole = verdict != "unexplained"
         sets = [(s.names, s.score(c, case.held)) for s in case.accepted(c)]
         sure = surenesses(chosen.names, sets, whole, c)
         sure |= {n: stated(1.0 - chosen.events[n], whole, c) for n in chosen.with_events(c) - chosen.names}
@@ -279,8 +280,10 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
 
 @dataclass(frozen=True)
 class CrossValidated:
-    """What the constants do on cases that they were not learned on, every fold by constants of the others; ``stated``
-    are the names per case, before the map."""
+    """Holds the results of the constants on held-out cases, every fold by constants learned on the others.
+
+    ``stated`` are the names per case, before the map.
+    """
 
     cases: int
     exactly_right: int

@@ -1,4 +1,4 @@
-"""How often the tool blames something when nothing is missing: null simulations over all twins and noises."""
+"""Measures the false-positive rate: null simulations over all twins and noises."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
 
 @dataclass(frozen=True)
 class _Null:
-    """One null recording to draw and diagnose."""
+    """Describes a null recording to draw and diagnose."""
 
     seed: int
     index: int
@@ -134,9 +134,9 @@ def nulls(
     if rows_file is not None and rows_file.exists():
         kept = json.loads(rows_file.read_text())
         seed = int(kept["seed"]) if seed is None else seed
-        for key, mine in (("seed", seed), ("max_samples", max_samples), ("revision", revision)):
-            if kept[key] != mine:
-                raise ValueError(f"{rows_file}: made with {key} {kept[key]}, not {mine}; remove it to begin anew")
+        for key, expected in (("seed", seed), ("max_samples", max_samples), ("revision", revision)):
+            if kept[key] != expected:
+                raise ValueError(f"{rows_file}: made with {key} {kept[key]}, not {expected}; remove it to begin anew")
         rows, before = kept["rows"], float(kept["seconds"])
     seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
     plans, kinds = null_plans(n)

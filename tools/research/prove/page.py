@@ -18,7 +18,7 @@ SEVERITIES = ("2", "4", "10", "30")
 
 
 def read(path: Path) -> dict[str, Any]:
-    """One proof. ValueError when the file is not one."""
+    """Read a proof. Raises ValueError when the file is not one."""
     try:
         body = json.loads(path.read_text())
     except (OSError, json.JSONDecodeError) as error:

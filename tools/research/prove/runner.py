@@ -41,7 +41,7 @@ def as_plain(report: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Done:
-    """One diagnosis: its JSON report, wall time, and CPU time of the process that made it."""
+    """Holds a diagnosis: its JSON report, wall time, and CPU time of its process."""
 
     name: str
     report: dict[str, Any]
@@ -50,7 +50,7 @@ class Done:
 
 
 def timed(job: tuple[str, Path, Diagnose]) -> Done:
-    """One diagnosis; an exception becomes a report with the verdict 'error'."""
+    """Run and time a diagnosis; an exception becomes a report with the verdict 'error'."""
     name, path, diagnose = job
     wall, cpu = time.perf_counter(), time.process_time()
     try:

@@ -94,12 +94,12 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any], *, far_off: b
     """
     rows: list[dict[str, Any]] = []
     for truth in answer["effects"]:
-        said = [p for p in report.get("physics") or [] if p.get("name") == truth["name"]]
-        if not said:
+        named = [p for p in report.get("physics") or [] if p.get("name") == truth["name"]]
+        if not named:
             continue
         for quantity, (value, unit) in truth["figures"].items():
             home = contract_unit(unit.removeprefix("unit of ")) if unit.startswith("unit of ") else unit
-            for name, par in (said[0].get("parameters") or {}).items():
+            for name, par in (named[0].get("parameters") or {}).items():
                 same = any(word in name.lower() for word in SAME.get(quantity, (quantity,)))
                 if quantity == "gap" and "half" in name:
                     same = False
@@ -129,16 +129,16 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any], *, far_off: b
 def score(
     answer: Mapping[str, Any], report: Mapping[str, Any], oracle: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
-    """One row of the result. ``oracle``: the noise rms on the held-out samples themselves, if the report names them."""
+    """Return a row of the result. ``oracle``: the noise rms on the held-out samples, if the report names them."""
     verdict = str(report.get("verdict", "error"))
-    said = names_of(report)
+    named = names_of(report)
     true = [t["name"] for t in answer["effects"] if t["name"] != "unknown"]
     location = report.get("location") or {}
     follows = [str(d.get("signal")) for d in location.get("depends_on") or []]
     row: dict[str, Any] = {
         "kind": answer["kind"], "twin": answer["twin"], "severity": answer["severity"],
         "excitation": answer["excitation"], "true": true, "form": [t["form"] for t in answer["effects"]],
-        "noise_kind": answer["noise_kind"], "verdict": verdict, "said": said, "follows": follows[:3],
+        "noise_kind": answer["noise_kind"], "verdict": verdict, "said": named, "follows": follows[:3],
         "error": report.get("error"), "tool_seconds": report.get("seconds"),
     }  # fmt: skip
     kind = answer["kind"]
@@ -155,13 +155,13 @@ def score(
     else:
         outputs = sorted({o for t in answer["effects"] for o in t["outputs"]})
         if kind == "single":
-            row["ok"] = bool(said) and said[0] == true[0]
-            row["in_group"] = bool(said) and true[0] in _group(report, said[0])
+            row["ok"] = bool(named) and named[0] == true[0]
+            row["in_group"] = bool(named) and true[0] in _group(report, named[0])
         else:
-            row["ok"] = set(true) <= set(said)
-            group = set().union(*(_group(report, n) for n in said)) if said else set()
+            row["ok"] = set(true) <= set(named)
+            group = set().union(*(_group(report, n) for n in named)) if named else set()
             row["in_group"] = set(true) <= group
-        row["extra"] = [n for n in said if n not in true]
+        row["extra"] = [n for n in named if n not in true]
         row["outputs_ok"] = bool(location.get("outputs")) and location["outputs"][0] in outputs
         row["stage_ok"] = location.get("stage") in {s for t in answer["effects"] for s in t["stages"]}
         row["depends_ok"] = bool(follows) and follows[0] in {d for t in answer["effects"] for d in t["depends"]}

@@ -75,7 +75,7 @@ def render(result: ProofResult) -> RenderableType:
 
 
 def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One line per case that went wrong: what was true, what was said."""
+    """Return a line per case that went wrong: the truth and the answer."""
     out: list[str] = []
     for r in rows:
         if r["ok"] and not r.get("extra"):
@@ -84,13 +84,13 @@ def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             continue
         word = "EXTRA" if r["ok"] else "WRONG"
         true = "+".join(r["true"]) or r["kind"]
-        said = "+".join(r["said"]) or "-"
+        named = "+".join(r["said"]) or "-"
         ratio = "" if r["ratio"] is None else f" held-out/noise {r['ratio']:.2f}"
         error = f" {r['error']}" if r["error"] else ""
         follows = f" follows {','.join(r['follows'])}" if r["kind"] == "unknown" else ""
         out.append(
             f"{word} {r['case']} {r['twin']} {true} ({'+'.join(r['form']) or '-'}) severity {r['severity']:g} "
-            f"{r['excitation']} noise {r['noise_kind']}: {r['verdict']} {said}{follows}{ratio}{error}"
+            f"{r['excitation']} noise {r['noise_kind']}: {r['verdict']} {named}{follows}{ratio}{error}"
         )
     return out
 

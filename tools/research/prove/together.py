@@ -41,7 +41,7 @@ LEAST, MOST, USUAL = 5, 20, 400
 
 
 def family(recording: Recording, count: int) -> Recording:
-    """One recording cut into ``count`` of equal length that are diagnosed together."""
+    """Draw a recording cut into ``count`` parts of equal length that are diagnosed together."""
     edges = [int(e) for e in np.linspace(0, recording.n, count + 1)]
     parts = tuple(Part(f"{k + 1}", a, b) for k, (a, b) in enumerate(itertools.pairwise(edges)))
     return replace(recording, split=Split(), segments=tuple(edges[1:-1]), parts=parts)
@@ -80,14 +80,14 @@ def run_one(seed: int, index: int, max_samples: int, *, null: bool) -> dict[str,
     joined = family(recording, count)
     began = time.process_time()
     report = diagnose(joined, jobs=1)
-    row |= {"drawn": True, "recordings": count, "samples": recording.n, **_said(report, plan.effects)}
+    row |= {"drawn": True, "recordings": count, "samples": recording.n, **_answers(report, plan.effects)}
     row["cpu_s"] = round(time.process_time() - began, 1)
     if not null:
-        row["alone"] = _said(diagnose(first_alone(joined), jobs=1), plan.effects)
+        row["alone"] = _answers(diagnose(first_alone(joined), jobs=1), plan.effects)
     return row
 
 
-def _said(report: Report, effects: Sequence[str]) -> dict[str, Any]:
+def _answers(report: Report, effects: Sequence[str]) -> dict[str, Any]:
     names = [p.name for p in report.physics] if report.verdict == "missing_physics" else []
     alike = {n for e in report.equivalent if set(e.names) & set(names) for n in e.names}
     together = report.together
