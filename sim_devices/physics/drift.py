@@ -38,7 +38,7 @@ def knots_over(t: Array, keep: np.ndarray, count: int) -> tuple[float, ...]:
 
 
 def increments(residual: Array, keep: np.ndarray, dt: float) -> tuple[float, float, float, int]:
-    """(white rms per sample, walk in unit/sqrt(s), z of the walk, block length) from block-mean differences.
+    """Estimate (white rms per sample, walk in unit/sqrt(s), z of the walk, block length) from block-mean differences.
 
     Var of the difference of neighbouring means of m samples: 2 s^2/m + q m dt (2/3). Two block lengths that differ
     by 16 separate the two (Allan variance slopes -1/2 and +1/2, IEEE Std 952-2020, annex C).

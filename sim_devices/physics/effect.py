@@ -47,7 +47,7 @@ feedback   a force phi(position, velocity) @ weights inside the equation of moti
 """
 
 Site = Literal["input", "output", "between"]
-"""``between`` two filters of a circuit; effects at an input may sit there, too."""
+"""Site of an effect. ``between`` is the place between two filters of a circuit, also for effects at an input."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class Parts:
     nonlinear: tuple[Parameter, ...] = ()
     weights: tuple[Parameter, ...] = ()
     penalty: Array | None = None
-    """(rows, weights): optional smoothness rows, in units of weight; scaled by the noise in the fit."""
+    """Optional smoothness rows (rows, weights), in units of weight; the fit scales them by the noise."""
 
 
 Prepare = Callable[[Array, Array, Context], Settings]
@@ -241,8 +241,8 @@ class Effect:
     """(settings, n) -> mask (n,) of the samples that the effect claims as its own events. They are excluded from the
     fit and from the score."""
     variants: tuple[Effect, ...] = ()
-    """The same physics in other shapes, or at another place of the equations (hysteresis as a force); same name, other
-    equation."""
+    """Other forms of the same physics, or other places in the equations (hysteresis as a force), with the same name and
+    another equation."""
     fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False

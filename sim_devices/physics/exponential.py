@@ -9,7 +9,7 @@ from hal.compiled import kernel
 
 @kernel
 def exponential(m):
-    """e^m of a square matrix (s, s) by scaling, an 18-term Taylor sum (norm below 1/2: error under 1e-16), squaring.
+    """Return e^m of a square matrix (s, s) by scaling, an 18-term Taylor sum (norm below 1/2) and squaring.
 
     C. Moler, C. Van Loan, SIAM Review 45 (2003) 3, method 3.
     """

@@ -15,7 +15,7 @@ from sim_devices.physics.statistics import rank_starts, thin
 
 @kernel
 def low_pass(x, dt, tau, starts):
-    """y' = (x - y) / tau with x linear between samples, exactly; settled at each start.
+    """Return the exact y of y' = (x - y) / tau with x linear between samples; settled at each start.
 
     y[k+1] = e y[k] + (1 - e) x[k] + (1 - (1 - e) tau/dt) (x[k+1] - x[k]),  e = exp(-dt/tau).
     """

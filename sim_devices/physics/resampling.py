@@ -10,7 +10,7 @@ from sim_devices.physics.effect import Array
 
 @kernel
 def resample(x, first, step, bend):
-    """x at positions ``first + step * k + bend * k^2`` (in samples), k = 0..n-1, by cubic convolution; edges are held.
+    """Return x at ``first + step * k + bend * k^2`` (samples), k = 0..n-1, by cubic convolution; edges are held.
 
     R. Keys, IEEE Trans. ASSP 29 (1981) 1153, eq. 15 (a = -1/2).
     """

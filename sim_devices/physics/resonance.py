@@ -13,7 +13,7 @@ from sim_devices.physics.statistics import least_squares, thin
 
 
 def discrete_mode(frequency_hz: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
-    """(ad, g0, g1) of z'' + 2 D w z' + w^2 z = w^2 x for x linear between samples, exactly (Van Loan 1978).
+    """Return exact (ad, g0, g1) of z'' + 2 D w z' + w^2 z = w^2 x for x linear between samples (Van Loan 1978).
 
     States are z and z'/w.
     """

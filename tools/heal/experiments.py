@@ -29,8 +29,10 @@ EVALUATIONS = 40
 
 @dataclass(frozen=True)
 class StackTwin:
-    """``file``: the corrected twin of stack ``axis`` (from 0), None where it could not be written; ``effects`` in it;
-    ``split``: the group for which an experiment was planned and played, empty where none was needed.
+    """Describes the corrected twin of stack ``axis`` (from 0).
+
+    ``file`` is None if it could not be written; ``effects`` are those in it; ``split`` is the group for which an
+    experiment was planned and played, empty if none was needed.
     """
 
     axis: int

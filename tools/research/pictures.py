@@ -48,7 +48,7 @@ def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def take(page: Any, folder: Path, views: tuple[str, ...]) -> None:
-    """One picture per view."""
+    """Take a picture per view."""
     page.wait_for_function("micron.link.state.status.state === 'running'", timeout=240_000)
     page.wait_for_function(f"micron.link.state.status.t_s > {STEADY_S}", timeout=240_000)
     # folders are those of the machine that takes the pictures

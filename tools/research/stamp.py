@@ -1,4 +1,4 @@
-"""From what, and when, a page was made."""
+"""Stamps a page with its revision and date."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from firmware_py.recording.revision import git_revision
 
 
 def revision_and_day() -> str:
-    """The source's revision and the day (UTC), as the head of a page made by a command says them."""
+    """Return the source's revision and the day (UTC) for the head of a generated page."""
     return f"{git_revision() or 'unknown'}, {datetime.now(UTC):%Y-%m-%d}"

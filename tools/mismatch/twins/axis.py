@@ -17,7 +17,7 @@ _NAMES = names(PARAMETERS["mechanical_axis"])
 
 
 def axis_twin(recording: Recording) -> DynamicTwin:
-    """theta = damping/mass, [stiffness/mass if the axis has a spring], 1/mass, offset/mass."""
+    """Build the twin; theta = damping/mass, [stiffness/mass with a spring], 1/mass, offset/mass."""
     text = recording.twin.parameters
     for key in text:
         if key not in _NAMES:

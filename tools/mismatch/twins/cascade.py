@@ -29,7 +29,7 @@ FILTER = ("A", "B", "C", "D")
 
 @dataclass(frozen=True)
 class CascadeTwin(Head):
-    """theta = parameters of the ``second`` filter, then those of the ``first`` that are ``free`` (indices)."""
+    """Simulates two filters; theta = those of the ``second``, then the ``free`` ones (indices) of the ``first``."""
 
     first: DynamicTwin
     second: DynamicTwin

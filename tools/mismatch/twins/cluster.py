@@ -20,8 +20,11 @@ _NEXT = ((1, 2), (2, 0), (0, 1))
 
 @dataclass(frozen=True)
 class ClusterTwin(ScaledOutputs):
-    """theta = bias of every output, then scale of every output (0 and 1 as given: the contract has neither, but
-    every accelerometer does). Positions are not base parameters: a wrong one is ``sensor_position_error``."""
+    """Simulates a cluster; theta = bias of every output, then scale of every output.
+
+    They are 0 and 1 as given: the contract has neither, but every accelerometer does. Positions are not base
+    parameters: a wrong one is ``sensor_position_error``.
+    """
 
     positions: Mapping[str, tuple[float, float, float]]
     static: bool = True

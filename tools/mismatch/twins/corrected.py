@@ -26,8 +26,10 @@ MOST_FREE = 3  # largest number of weights of an effect that are re-fitted one b
 
 @dataclass(frozen=True)
 class CorrectedTwin(Head):
-    """``inner`` is the core twin with its effects at ``found`` (its own theta). ``of[j]`` is the parameter of this
-    twin that moves parameter ``j`` of the inner model, ``factor[j]`` says that it does so by multiplying it.
+    """Wraps ``inner``, the core twin with its effects at ``found`` (its own theta).
+
+    ``of[j]`` is the parameter of this twin that moves parameter ``j`` of the inner model; ``factor[j]`` is True if it
+    multiplies it.
     """
 
     inner: Model

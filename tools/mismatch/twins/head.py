@@ -23,7 +23,7 @@ class Head:
 
 @dataclass(frozen=True)
 class ScaledOutputs(Head):
-    """theta = offset of every output, then scale of every output; nothing remembers."""
+    """Scales inputs without memory; theta = offset of every output, then scale of every output."""
 
     def sensitivity(self, output: str, theta: Array) -> float:
         """See Twin."""

@@ -44,7 +44,7 @@ def between_samples(u: Array, hold: Hold) -> Array:
 
 @dataclass(frozen=True)
 class Discrete:
-    """``x[k+1] = ad x[k] + g0 u[k] + g1 u[k+1]`` for one input; ad (s, s), g0 and g1 (s,)."""
+    """Holds ``x[k+1] = ad x[k] + g0 u[k] + g1 u[k+1]`` for one input; ad (s, s), g0 and g1 (s,)."""
 
     ad: Array
     g0: Array

@@ -40,8 +40,10 @@ FORGOTTEN = 20.0  # least number of time constants in a record; a slower state i
 
 @dataclass(frozen=True)
 class OdeTwin(Head):
-    """``signals``: what the equations see, inputs first, then context. ``given``: the ``[twin.parameters]`` table,
-    ``names`` its numbers in the order of the equations, ``free`` which of them may be re-fitted.
+    """Simulates differential equations.
+
+    ``signals``: inputs of the equations, then context. ``given``: the ``[twin.parameters]`` table, ``names`` its
+    numbers in the order of the equations, ``free`` the indices of those that may be re-fitted.
     """
 
     equations: Equations

@@ -40,7 +40,7 @@ class Matrices:
 
 
 def state_space_twin(recording: Recording) -> DynamicTwin:
-    """theta = pole parameters, numerator coefficients (in units of the given scale), y0 of every output."""
+    """Build the twin; theta = pole parameters, scaled numerator coefficients, y0 of every output."""
     m = without_constant(read_matrices(recording), recording.dt)
     inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
     dt = recording.dt

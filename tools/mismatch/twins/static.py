@@ -17,7 +17,7 @@ from tools.mismatch.twins.head import ScaledOutputs
 
 @dataclass(frozen=True)
 class StaticTwin(ScaledOutputs):
-    """``y_o = offset_o + scale_o * x_drive(o)``; theta = all offsets, then all scales.
+    """Simulates ``y_o = offset_o + scale_o * x_drive(o)``; theta = all offsets, then all scales.
 
     ``names`` are the contract's (offset, scale). ``given`` (outputs, 2) holds the engineer's numbers, NaN where
     missing: those are estimated by least squares.
