@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.statistics import after_jumps
-from tools.mismatch.engine.noise import NoiseFloor
+from tools.mismatch.engine.noise import NoiseFloor, spectral_floor
 from tools.mismatch.engine.split import Span, Split
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
@@ -153,6 +153,27 @@ class Problem:
 
     def with_floors(self, floors: Mapping[str, NoiseFloor]) -> Problem:
         return replace(self, floors=dict(floors))
+
+    def quieter(self, residual: Mapping[str, Array]) -> Problem:
+        """Return the problem with lower noise floors where ``residual`` (m,) of a better model shows them: what is
+        missing may be rough enough to look like noise. Floors that were declared or found by repetition stay.
+        """
+        floors = dict(self.floors)
+        spans = sorted(self.held_spans, key=lambda s: s[0] - s[1])[:6]
+        for o, old in self.floors.items():
+            if old.method != "spectrum" or o not in residual:
+                continue
+            found = [spectral_floor(residual[o][a:b], 1 / self.recording.dt) for a, b in spans if b - a >= 128]
+            sizes = [float(b - a) for a, b in spans if b - a >= 128]
+            if not found:
+                continue
+            rms = float(np.sqrt(np.average([f[0] ** 2 for f in found], weights=sizes)))
+            if old.step > 0:
+                # readings on a grid: noise shows as the readings that fell on the other side of an edge
+                rms = max(rms, min(old.step / np.sqrt(12.0), float(np.std(residual[o][self.held_rows]))))
+            if rms < 0.95 * old.rms:
+                floors[o] = replace(old, rms=rms, white_rms=min(old.white_rms, rms))
+        return self.with_floors(floors) if floors != dict(self.floors) else self
 
     def base(self) -> Model:
         return Model(self.twin)

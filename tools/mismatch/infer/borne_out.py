@@ -21,9 +21,10 @@ Values = dict[str, dict[str, ParameterValue]]
 def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple[Withheld, ...]]:
     """Return ``sets`` (best first, the last one empty) from the first supported one on, and the withheld effects.
 
-    A set with an effect all of whose sizes may be zero is skipped, and so is every other set with that name.
+    A set with an effect all of whose sizes may be zero is skipped, and so is every larger set; beside fewer others the
+    same effect may be sure.
     """
-    left, withheld = list(sets), list[Withheld]()
+    left, withheld = list(sets), dict[str, Withheld]()
     given = as_given(store.problem).residual
     while left[0].placed:
         s = left[0]
@@ -38,10 +39,10 @@ def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple
         doubts = [d for k in range(len(s.placed)) if (d := _doubt(store, s, k, values, unsure)) is not None]
         if not doubts:
             break
-        names = {s.placed[d.k].effect.name for d in doubts}
-        left = [other for other in left if not names & other.names]
-        withheld += [_entry(store, s, d, values, left[0].names) for d in doubts]
-    return left, tuple(withheld)
+        left = [other for other in left if not s.names <= other.names]
+        for d in doubts:
+            withheld.setdefault(s.placed[d.k].effect.name, _entry(store, s, d, values, left[0].names))
+    return left, tuple(w for name, w in withheld.items() if name not in left[0].names)
 
 
 def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty) -> Doubt | None:

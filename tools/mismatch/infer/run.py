@@ -90,7 +90,8 @@ def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:
     """Return the report of an answer."""
-    posed, store = inferred.posed, inferred.found.store
+    store = inferred.found.store
+    posed = replace(inferred.posed, problem=store.problem)  # with the noise floors that the search found
     decision = verdict_of(posed, store, answer)
     named = decision.verdict in ("missing_physics", "unexplained")
     chosen = answer.chosen if named else store.base

@@ -11,6 +11,7 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.pose import hint_of, may_hint
 from tools.mismatch.engine.problem import Hint, Problem
+from tools.mismatch.engine.score import fit_rms
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort, Trial, try_all
 from tools.mismatch.infer.constants import Constants
@@ -55,7 +56,7 @@ class Search:
         self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
         jobs: int = 1, progress: Progress | None = None, moves: int = MOVES,
     ) -> None:  # fmt: skip
-        self.problem, self.jobs, self.progress = problem, jobs, progress
+        self.jobs, self.progress = jobs, progress
         self.effects = tuple(e for e in effects if e.claims is None)
         self.store = Store(problem, base, constants, [e for e in effects if e.claims is not None])
         self.expanded: set[Key] = set()
@@ -72,6 +73,7 @@ class Search:
         """Extend until nothing can gain, then swap; refine the sets between which the decision is made."""
         self.expand(self.store.base)
         self.combine()
+        self.store.listen(self.store.ranked()[0])
         self.pair()
         self.grow()
         for _ in range(SWAPS):
@@ -97,11 +99,11 @@ class Search:
 
         If outputs share nothing, the missing effects are independent, and extending one by one may not find them all.
         """
-        if not self.problem.twin.apart or len(self.problem.twin.outputs) < 2:
+        if not self.store.problem.twin.apart or len(self.store.problem.twin.outputs) < 2:
             return
         alone = [s for s in self.store.sets.values() if len(s.placed) == 1 and s.proper]
         alone.sort(key=lambda s: (-self.store.score(s), sorted(s.names)))
-        grown, tried = self.store.base, dict.fromkeys(self.problem.twin.outputs, 0)
+        grown, tried = self.store.base, dict.fromkeys(self.store.problem.twin.outputs, 0)
         for s in alone:
             where = s.placed[0].outputs
             if {o for p in grown.placed for o in p.outputs} & set(where) or max(tried[o] for o in where) >= RIVALS:
@@ -112,7 +114,7 @@ class Search:
                 grown = more
 
     def pair(self) -> None:
-        """Extend the effects that gain most before their prices, where no set explains half of what can be explained.
+        """Extend effects that gain anything before their prices, where no set explains half of what can be explained.
 
         Of two effects that only together make the recording, each alone may gain less than its price, and an effect
         at many places less than at one. A ranking by score would not extend them.
@@ -122,7 +124,9 @@ class Search:
         if max(gain.values(), default=0.0) >= HALF * self.most_gain(base):
             return
         alone = [s for k, s in self.store.sets.items() if len(s.placed) == 1 and gain.get(k, 0.0) > 0.0]
-        alone.sort(key=lambda s: (-gain[s.key], sorted(s.key)))
+        # what a half of a pair leaves held out is noisy: how far each gets where it was fitted says more
+        left = {s.key: sum(np.log(v) for v in fit_rms(self.store.problem, s.fitted).values()) for s in alone}
+        alone.sort(key=lambda s: (left[s.key], sorted(s.key)))
         for s in alone[:BEAM]:
             if self.moves:
                 self.moves -= 1
@@ -166,6 +170,7 @@ class Search:
                 return
             self.moves -= 1
             self.expand(chosen)
+            self.store.listen(self.store.ranked()[0])
             self.idle = 0 if self.store.score(self.store.ranked()[0]) > best else self.idle + 1
             if self.idle >= PATIENCE:
                 return
@@ -194,12 +199,12 @@ class Search:
         room, least = self.store.room(s), self.store.constants.per_parameter
         pool = [
             p
-            for p in places(self.problem, self.effects, s.placed)
+            for p in places(self.store.problem, self.effects, s.placed)
             if not s.placed or p.effect.test is not None or any(room[o] > least for o in p.outputs)
         ]
         least_fits, most_fits = FITS_LATER if s.placed else FITS
         trials = try_all(
-            self.problem, s.fitted, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
+            self.store.problem, s.fitted, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
             what=f"{len(s.names)}", least=least_fits, most=most_fits, effort=self.effort,
         )  # fmt: skip
         if not s.placed:
@@ -211,7 +216,7 @@ class Search:
                 self.store.seen[part] = t.candidate
             if t.fitted is not None and not t.refused:
                 children.append((self.store.put(t.fitted), t.placed))
-        if self.problem.twin.apart and len(self.problem.twin.outputs) > 1:
+        if self.store.problem.twin.apart and len(self.store.problem.twin.outputs) > 1:
             self.spread(s, children)
 
     def spread(self, s: Scored, children: Sequence[tuple[Scored, Placed]]) -> None:

@@ -109,6 +109,20 @@ class Store:
         self.outputs = outputs_at_odds([*self.room(self.scored(base)).values()])
         self.base = self.put(base)
 
+    def listen(self, s: Scored) -> None:
+        """Lower the noise floors to what the set shows them to be: what is missing may be rough enough to look like
+        noise, and a search against such a floor would end too early."""
+        quieter = self.problem.quieter(unpredicted(self.problem, s.fitted).residual)
+        if quieter is self.problem:
+            return
+        self.problem = quieter
+        self._best, self._exact = best_log_density(quieter), exact_log_density(quieter)
+        self._tests.clear()
+        for key, old in self.sets.items():
+            # the weight of a law of noise depends on the floor
+            if any(p.effect.predict is not None for p in old.placed):
+                self.sets[key] = self.scored(old.fitted)
+
     def put(self, fitted: Fit) -> Scored:
         """Score a fit. Of two fits of a set the better one is kept."""
         scored = self.scored(fitted)
