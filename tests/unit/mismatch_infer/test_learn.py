@@ -149,7 +149,7 @@ def test_names_beside_something_unexplained_are_stated_as_seldom_as_they_are_rig
         whole = i % 2 == 0
         true = "a" if rng.random() < (0.95 if whole else 0.4) else "b"
         left = 0.0 if whole else 50.0
-        sets = (_set("", -1.0, 0), replace(_set("a", 0.0), rest=left, taken=60.0), _set("b", -0.5))
+        sets = (_set("", -1.0, 0), replace(_set("a", 0.0), rest=left, explained=60.0), _set("b", -0.5))
         cases.append(Case(f"c{i}", "single", frozenset(true), 900, sets, None))
     c = learn_sure(START, list(raw_surenesses(START, cases[:100])))
     names = list(raw_surenesses(START, cases[100:]))
