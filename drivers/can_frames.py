@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 from drivers.base import next_due_ns
 from drivers.dbc import DbcDatabase
 from drivers.registry import Traffic
@@ -23,37 +25,55 @@ def _crc_table() -> bytes:
     return bytes(table)
 
 
-_CRC_TABLE = _crc_table()
+CRC_TABLE = _crc_table()
+"""CRC-8/SAE-J1850 of each byte, as ``crc8_j1850`` uses it."""
 
 
 def crc8_j1850(data: bytes) -> int:
     """Return the CRC-8/SAE-J1850: polynomial 0x1D, start 0xFF, result inverted; "123456789" gives 0x4B."""
-    table = _CRC_TABLE
+    table = CRC_TABLE
     crc = 0xFF
     for byte in data:
         crc = table[crc ^ byte]
     return crc ^ 0xFF
 
 
+BEAT_DUE_NS, BEAT_STATE, BEATS, BEAT_WORDS = range(4)
+"""Places in ``HostHeartbeat.words``: when the next one is due, its data byte, and how many were sent."""
+
+
 class HostHeartbeat:
-    """HOST_HEARTBEAT at 50 Hz, sent by whoever calls ``beat`` often enough. One per bus and process."""
+    """HOST_HEARTBEAT at 50 Hz, sent by whoever calls ``beat`` often enough. One per bus and process.
+
+    A compiled loop sends it over the same ``words``."""
 
     def __init__(self, bus: CanBus, clock: Clock, database: DbcDatabase) -> None:
-        self.state = 0
-        self.sent = 0
+        self.words = array("q", bytes(8 * BEAT_WORDS))
+        self.can_id = database.get_message_by_name("HOST_HEARTBEAT").frame_id
         self._bus = bus
         self._clock = clock
-        self._id = database.get_message_by_name("HOST_HEARTBEAT").frame_id
-        self._due_ns = 0
+
+    @property
+    def state(self) -> int:
+        """The data byte."""
+        return self.words[BEAT_STATE]
+
+    @state.setter
+    def state(self, state: int) -> None:
+        self.words[BEAT_STATE] = state & 0xFF
+
+    @property
+    def sent(self) -> int:
+        return self.words[BEATS]
 
     def beat(self) -> None:
         """Send if 20 ms have passed since the last one."""
-        now_ns = self._clock.now_ns()
-        if now_ns < self._due_ns:
+        words, now_ns = self.words, self._clock.now_ns()
+        if now_ns < words[BEAT_DUE_NS]:
             return
-        self._due_ns = next_due_ns(self._due_ns, now_ns, HEARTBEAT_PERIOD_NS)
-        self._bus.send(CanFrame(self._id, bytes((self.state & 0xFF,))), 0.0)
-        self.sent += 1
+        words[BEAT_DUE_NS] = next_due_ns(words[BEAT_DUE_NS], now_ns, HEARTBEAT_PERIOD_NS)
+        self._bus.send(CanFrame(self.can_id, bytes((words[BEAT_STATE],))), 0.0)
+        words[BEATS] += 1
 
 
 def host_heartbeat() -> Traffic:

@@ -14,21 +14,19 @@ Source: Linux, ``Documentation/i2c/dev-interface.rst`` and ``include/uapi/linux/
 
 from __future__ import annotations
 
-import ctypes
 import errno
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from hal.backends.unix_i2c import HEAD, REPLY, SEGMENT
 from hal.compiled import kernel
 from hal.fd_kernels import EINTR, last_errno, now_ns, read_fd, write_fd
 from hal.i2c_carrier import LINUX, PYTHON
+from hal.python_call import call_python
 from hal.scratch import stack_index
 from hal.types import I2cOp, I2cRead, I2cWrite
 
@@ -54,7 +52,7 @@ class Transfer(NamedTuple):
 
 
 def new_transfer(kind: int, address: int, ops: Sequence[I2cOp], call: int = 0) -> Transfer:
-    """Return the memory of a transfer of ``ops`` to the 7-bit ``address``. ``call``: see ``python_call``."""
+    """Return the memory of a transfer of ``ops`` to the 7-bit ``address``. ``call``: see ``hal.python_call``."""
     request = HEAD.pack(address, len(ops), 0)
     begins: list[int] = []
     for op in ops:
@@ -100,32 +98,13 @@ def ops_of(t: Transfer) -> list[I2cOp]:
     return ops
 
 
-_Call = ctypes.CFUNCTYPE(ctypes.c_int64)
-
-
-def python_call(function: Callable[[], int]) -> tuple[int, Any]:
-    """Return the address by which compiled code calls ``function``, with the GIL, and the object that keeps it alive.
-    ``function`` returns 0, or a failure as ``transfer`` does; it must not raise."""
-    made = _Call(function)
-    return ctypes.cast(made, ctypes.c_void_p).value or 0, made
-
-
-@intrinsic
-def _call(typing_context: Any, address: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        function = ir.FunctionType(ir.IntType(64), [])
-        return builder.call(builder.inttoptr(arguments[0], function.as_pointer()), [])
-
-    return types.int64(types.int64), generate
-
-
 @kernel
 def transfer(t: Transfer, fd: int) -> int:
     """Make the transfer; its answer is then in ``t.reply[REPLY.size:]``. Return 0, the status of an emulated bus (above
     0), or a negative errno: -EAGAIN when the socket gave no answer in time."""
     words = t.words
     if words[KIND] == PYTHON:
-        return _call(words[CALL])  # pyright: ignore[reportCallIssue]
+        return call_python(words[CALL])  # pyright: ignore[reportCallIssue]
     if words[KIND] == LINUX:
         return _transfer_linux(t, fd)
     return _transfer_socket(t, fd)

@@ -1,10 +1,10 @@
 """The emulated world as a process of its own, in real time: ``python -m sim_devices.process JOB.json``.
 
 The job file (written by ``sim_devices.process_world``) holds the bench description and where to put things. The
-process serves each serial bus on a pty (and, on request, a TCP port), each I2C bus on a Unix socket, each CAN bus on
-UDP multicast or an interface of the kernel (or, with ``sim://NAME?via=slcan``, as a serial adapter on a pty) and writes
-their URIs to ``endpoints.json`` when it is ready. It obeys orders on ``control.sock`` (``sim_devices.control``); on
-SIGTERM or when its parent is gone it writes ``truth.npz`` and ends.
+process serves each serial bus on a pty (and, on request, a TCP port), each I2C bus and each CAN bus on a Unix socket
+(a CAN bus with ``sim://NAME?via=slcan`` as a serial adapter on a pty, and for programs of others on UDP multicast or an
+interface of the kernel) and writes their URIs to ``endpoints.json`` when it is ready. It obeys orders on
+``control.sock`` (``sim_devices.control``); on SIGTERM or when its parent is gone it writes ``truth.npz`` and ends.
 
 One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
 millisecond. For a firmware in real time device clocks never stretch: after a stall every scan that was due is made up,
@@ -36,7 +36,8 @@ from sim_devices.control import WorldControl
 from sim_devices.faces import ByteFace
 from sim_devices.faults import inject
 from sim_devices.lateness import Lateness
-from sim_devices.transports.can_carrier import free_udp_port, on_multicast, on_socketcan
+from sim_devices.transports.can_carrier import CanCarrier, free_udp_port, on_multicast, on_socketcan
+from sim_devices.transports.can_socket import CanSocketServer
 from sim_devices.transports.control_socket import ControlSocket
 from sim_devices.transports.i2c_socket import I2cSocketServer
 from sim_devices.transports.pty_carrier import PtyCarrier
@@ -130,12 +131,17 @@ class WorldProcess:
         slcan = {n for n, bus in description["bus"].items() if str(bus["uri"]).endswith("?via=slcan")}
         hubs = self.world.buses.can
         self._slcan = {n: PtyCarrier(SlcanAdapter(hub)) for n, hub in hubs.items() if n in slcan}
-        interfaces = dict(zip([n for n in hubs if n not in slcan], serve.can, strict=False))
-        self._can = {
-            n: on_socketcan(hub, interfaces[n]) if n in interfaces else on_multicast(hub, free_udp_port())
-            for n, hub in hubs.items()
-            if n not in slcan
-        }
+        open_hubs = {n: hub for n, hub in hubs.items() if n not in slcan}
+        interfaces = dict(zip(open_hubs, serve.can, strict=False))
+        self._can: dict[str, CanCarrier] = {}
+        self._can_sockets: dict[str, CanSocketServer] = {}
+        for n, hub in open_hubs.items():
+            if n in interfaces:
+                self._can[n] = on_socketcan(hub, interfaces[n])
+            elif self.serves_others:
+                self._can[n] = on_multicast(hub, free_udp_port())
+            else:
+                self._can_sockets[n] = CanSocketServer(hub, sockets / f"{n}.sock")
         self._all_ptys = [*self._ptys.values(), *self._slcan.values()]
         speaks = [id(face) for face in self.world.buses.serial.values()]
         self._devices = [(face, id(face) in speaks) for face in self.world.timed_faces()]
@@ -178,7 +184,7 @@ class WorldProcess:
         uris = {name: f"serial://{pty.path}" for name, pty in self._ptys.items()}
         uris |= {name: f"slcan://{pty.path}" for name, pty in self._slcan.items()}
         uris |= {name: f"unix-i2c://{server.path}" for name, server in self._i2c.items()}
-        return uris | {name: can.uri for name, can in self._can.items()}
+        return uris | {name: can.uri for name, can in (self._can | self._can_sockets).items()}
 
     def run(self) -> None:
         """Serve until asked to stop, then write what happened."""
@@ -216,6 +222,8 @@ class WorldProcess:
         for server in self._i2c.values():
             watched += server.filenos()
         watched += [can.fileno() for can in self._can.values()]
+        for can in self._can_sockets.values():
+            watched += can.filenos()
         for line in self._tcp.values():
             watched += line.filenos()
         watched += self._control.filenos()
@@ -281,6 +289,10 @@ class WorldProcess:
             if fileno == can.fileno():
                 can.pump(self._now_ns)
                 return
+        for can_socket in self._can_sockets.values():
+            if fileno in can_socket.filenos():
+                can_socket.pump(fileno, self._now_ns)
+                return
         for pty in self._all_ptys:
             if fileno == pty.fileno():
                 pty.receive(self._now_ns)
@@ -310,7 +322,7 @@ class WorldProcess:
         (self._runtime_dir / "world.json").write_text(json.dumps(facts), encoding="utf-8")
         for pty in self._all_ptys:
             pty.unplug()
-        for server in (*self._i2c.values(), *self._can.values(), *self._tcp.values()):
+        for server in (*self._i2c.values(), *self._can.values(), *self._can_sockets.values(), *self._tcp.values()):
             server.close()
         self._control.close()
 

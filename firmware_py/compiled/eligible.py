@@ -9,7 +9,7 @@ from drivers.options import Adxl203Options
 from drivers.registry import find_driver
 from drivers.specs import check_devices
 from firmware_py.endoscope.wiring import is_endoscope
-from hal.bench import BenchFile, Pace
+from hal.bench import BenchFile, CanSpec, Pace
 from hal.errors import BenchError
 
 IN_TICK = ("daq", "output")
@@ -30,6 +30,9 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
         driver = find_driver(spec.driver)
         if driver.role in IN_TICK and not driver.has_kernels:
             reasons.append(f"device.{name}: its driver {spec.driver} has no kernels on bytes")
+        bus = bench.description.bus.get(spec.bus or "")
+        if driver.role in IN_TICK and isinstance(bus, CanSpec) and not _has_frame_socket(bus.uri):
+            reasons.append(f"device.{name}: its bus {bus.uri} has no socket of single frames; socketcan:// has")
     n_axes = sum(len(o.channels) for o in options.values() if isinstance(o, Adxl203Options))
     if n_axes > AXES:
         reasons.append(f"{n_axes} accelerometer axes: what tells which of more than {AXES} is wrong is Python")
@@ -38,6 +41,10 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
     if injected:
         reasons.append("--inject is Python between the loop and a device")
     return reasons
+
+
+def _has_frame_socket(uri: str) -> bool:
+    return uri.startswith(("socketcan://", "unix-can://", "sim://")) and not uri.endswith("?via=slcan")
 
 
 SPIN_PART = 0.25

@@ -257,6 +257,7 @@ class CompiledMicron(Micron):
             words[at.ORDER] = at.CALLED_BACK
             if self._is_virtual:
                 self._output.flush()
+            self._output.catch_up()
             self._take_over(result)
         if self._beside_error is not None:
             raise self._beside_error

@@ -17,7 +17,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from drivers.output_guard_steps import CLIPPED, SLEW_LIMITED
-from drivers.piezo import dac_loop, e727_loop
+from drivers.piezo import can_loop, dac_loop, e727_loop
 from drivers.piezo.e727_loop import HANDED_OVER, SENT
 from drivers.piezo.gcs import UNSENT
 from firmware_py.guardian.gate import IS_ALONE, announce, has_lease, silence_ns
@@ -116,33 +116,44 @@ def is_stuck(out: Any) -> bool:
     raise NotImplementedError
 
 
-def _is_dac(out: Any) -> bool:
-    return getattr(out, "instance_class", None) is GatedDac
+@kernel
+def write_can(out: can_loop.CanMemory, fd: int, values_V: NDArray[np.float64]) -> tuple[int, int]:
+    """Do what ``CanAmplifier.write`` does. Return the result and the guard's mask."""
+    is_sent, mask = can_loop.write(out, fd, values_V)
+    return (SENT if is_sent else HANDED_OVER), mask
+
+
+def _is(out: Any, memory: type) -> bool:
+    return getattr(out, "instance_class", None) is memory
 
 
 @overload(write, strict=False)
 def _write(out: Any, fd: Any, values_V: Any, now_ns: Any) -> Any:
-    if _is_dac(out):
+    if _is(out, GatedDac):
         return lambda out, fd, values_V, now_ns: write_dac(out, fd, values_V)
+    if _is(out, can_loop.CanMemory):
+        return lambda out, fd, values_V, now_ns: write_can(out, fd, values_V)
     return lambda out, fd, values_V, now_ns: e727_loop.write(out, fd, values_V, now_ns)
 
 
 @overload(step_ramp, strict=False)
 def _step_ramp(out: Any, fd: Any, now_ns: Any) -> Any:
-    if _is_dac(out):
+    if _is(out, GatedDac):
         return lambda out, fd, now_ns: step_ramp_dac(out, fd)
+    if _is(out, can_loop.CanMemory):
+        return lambda out, fd, now_ns: can_loop.step_ramp(out, fd)
     return lambda out, fd, now_ns: e727_loop.step_ramp(out, fd, now_ns)
 
 
 @overload(verify, strict=False)
 def _verify(out: Any, fd: Any) -> Any:
-    if _is_dac(out):
+    if _is(out, GatedDac):
         return lambda out, fd: dac_loop.verify(out.dac, fd)
     return lambda out, fd: True
 
 
 @overload(is_stuck, strict=False)
 def _is_stuck(out: Any) -> Any:
-    if _is_dac(out):
-        return lambda out: False
-    return lambda out: out.link.sizes[UNSENT] > 0
+    if _is(out, e727_loop.OutputMemory):
+        return lambda out: out.link.sizes[UNSENT] > 0
+    return lambda out: False

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_output import DacOutput
 from drivers.piezo.e727 import E727
 from firmware_py.compiled.ports import Descriptor, Fed, lacks_descriptor
 from firmware_py.guardian.amplifier import GuardedAmplifier
+from hal.can_carrier import PYTHON as CAN_PYTHON
+from hal.can_carrier import CanCarrier
+from hal.can_wire import FRAME_BYTES, pack_frame, unpack_frame
 from hal.clock import VirtualClock
-from hal.contracts import AnalogOutput, Clock, I2cBus
+from hal.contracts import AnalogOutput, CanBus, Clock, I2cBus
 from hal.errors import BusError, HalError
 from hal.i2c_carrier import PYTHON, I2cCarrier
+from hal.middleware.share import CanView
 from hal.types import I2cOp
 
 
@@ -38,6 +44,10 @@ class Side(Protocol):
     def fileno(self) -> int: ...
     def take_over(self, is_read_back: bool) -> None:
         """Hand to the driver what the thread has left to it. ``is_read_back``: it came from reading back."""
+        ...
+
+    def catch_up(self) -> None:
+        """Let the driver pass over what has come for it while the thread was at work."""
         ...
 
     def feed(self) -> None: ...
@@ -72,6 +82,9 @@ class E727Side:
     def take_over(self, is_read_back: bool) -> None:
         """The driver's memory is as it needs it."""
 
+    def catch_up(self) -> None:
+        """The thread reads the driver's own port."""
+
     def feed(self) -> None:
         port = self._driver.port
         assert isinstance(port, Fed)
@@ -86,39 +99,70 @@ class E727Side:
         """The port is the bench's."""
 
 
-class VirtualBus:
-    """Makes the thread's transfers on any bus of virtual time, as functions that compiled code calls."""
+class VirtualCalls:
+    """Makes what the thread asks of a bus of virtual time, as functions that compiled code calls.
+
+    ``fixed_ns`` (1,) is the thread's time: a call begins then and moves it to when it has ended."""
 
     CARRIER = PYTHON
 
-    def __init__(self, bus: I2cBus, clock: Clock, address: int, fixed_ns: NDArray[np.int64]) -> None:
-        self._bus, self._clock, self._address, self._fixed_ns = bus, clock, address, fixed_ns
-        self._error: BaseException = BusError("no transfer has failed")
-        self._transfers: list[Any] = []
+    def __init__(self, clock: Clock, fixed_ns: NDArray[np.int64]) -> None:
+        self._clock, self._fixed_ns = clock, fixed_ns
+        self._error: BaseException = BusError("no call has failed")
         self._kept: list[object] = []
 
-    def add_call(self) -> int:
-        """Return the address of the function for the transfer that ``serve`` will be given next."""
-        from hal.i2c_kernels import ops_of, python_call  # numba
+    def add_call(self, do: Callable[[], int]) -> int:
+        """Return the address by which compiled code calls ``do``. It gives -1 where ``do`` raises; ``error`` tells."""
+        from hal.python_call import python_call  # numba
 
-        number = len(self._kept)
-        address, kept = python_call(lambda: self._transfer(self._transfers[number], ops_of))
+        address, kept = python_call(lambda: self._call(do))
         self._kept.append(kept)
         return address
 
+    def _call(self, do: Callable[[], int]) -> int:
+        self._clock.sleep_until_ns(int(self._fixed_ns[0]))
+        try:
+            return do()
+        except BaseException as error:  # compiled code could not pass it on
+            self._error = error
+            return -1
+        finally:
+            self._fixed_ns[0] = self._clock.now_ns()
+
+    def error(self) -> HalError:
+        """Return the error of the last call that failed. Raises what is no error of the bus."""
+        if isinstance(self._error, HalError):
+            return self._error
+        raise self._error
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        """The bus is the bench's."""
+
+
+class VirtualBus(VirtualCalls):
+    """Makes the thread's transfers on any I2C bus of virtual time."""
+
+    def __init__(self, bus: I2cBus, clock: Clock, address: int, fixed_ns: NDArray[np.int64]) -> None:
+        super().__init__(clock, fixed_ns)
+        self._bus, self._address = bus, address
+        self._transfers: list[Any] = []
+
+    def add_transfer(self) -> int:
+        """Return the address of the function for the transfer that ``serve`` will be given next."""
+        from hal.i2c_kernels import ops_of  # numba
+
+        number = len(self._kept)
+        return self.add_call(lambda: self._transfer(self._transfers[number], ops_of))
+
     def serve(self, transfers: list[Any]) -> None:
-        """Make ``transfers``, in the order of ``add_call``."""
+        """Make ``transfers``, in the order of ``add_transfer``."""
         self._transfers = transfers
 
     def _transfer(self, transfer: Any, ops_of: Callable[[Any], list[I2cOp]]) -> int:
-        self._clock.sleep_until_ns(int(self._fixed_ns[0]))
-        try:
-            answer = self._bus.transfer(self._address, ops_of(transfer))
-        except BaseException as error:  # compiled code could not pass it on: ``failure`` does
-            self._error = error
-            return 1
-        finally:
-            self._fixed_ns[0] = self._clock.now_ns()
+        answer = self._bus.transfer(self._address, ops_of(transfer))
         if answer:
             transfer.reply[-len(answer) :] = np.frombuffer(answer, np.uint8)
         return 0
@@ -126,17 +170,49 @@ class VirtualBus:
     def for_thread(self) -> VirtualBus:
         return self
 
-    def fileno(self) -> int:
-        return -1
-
     def failure(self, code: int, address: int) -> HalError:
-        """See ``I2cCarrier``. Raises what is no error of the bus."""
-        if isinstance(self._error, HalError):
-            return self._error
-        raise self._error
+        """See ``I2cCarrier``."""
+        return self.error()
 
-    def close(self) -> None:
-        """The bus is the bench's."""
+
+class VirtualCan(VirtualCalls):
+    """Sends and receives the thread's frames on any CAN bus of virtual time."""
+
+    CARRIER = CAN_PYTHON
+
+    def __init__(self, bus: CanBus, clock: Clock, fixed_ns: NDArray[np.int64]) -> None:
+        super().__init__(clock, fixed_ns)
+        self._bus = bus
+        self._line: Any = None
+
+    def serve(self, line: Any) -> None:
+        """Send and receive the frames of ``line``."""
+        self._line = line
+
+    def send(self) -> int:
+        """See ``hal.can_kernels.send``."""
+        frame = unpack_frame(self._line.outgoing.tobytes(), 0)
+        assert frame is not None
+        self._bus.send(frame, 0.0)
+        return 0
+
+    def receive(self) -> int:
+        """See ``hal.can_kernels.receive``."""
+        from hal.can_kernels import CAME, NOTHING, RECEIVED_NS  # numba
+
+        frame = self._bus.recv(0.0)
+        if frame is None:
+            return NOTHING
+        self._line.received[:FRAME_BYTES] = np.frombuffer(pack_frame(frame), np.uint8)
+        self._line.words[RECEIVED_NS] = frame.t_ns
+        return CAME
+
+    def for_thread(self, can_ids: Iterable[int]) -> VirtualCan:
+        return self
+
+    def failure(self, code: int) -> HalError:
+        """See ``CanCarrier``."""
+        return self.error()
 
 
 class DacSide:
@@ -162,7 +238,7 @@ class DacSide:
         virtual = None
         if isinstance(self._clock, VirtualClock):
             self._carrier = virtual = VirtualBus(driver.bus, self._clock, driver.address, fixed_ns)
-            calls = virtual.add_call(), virtual.add_call()
+            calls = virtual.add_transfer(), virtual.add_transfer()
         else:
             assert isinstance(driver.bus, I2cCarrier)
             self._carrier = driver.bus.for_thread()
@@ -197,6 +273,9 @@ class DacSide:
             assert self._carrier is not None
             self._driver.pending = self._carrier.failure(failed, self._driver.address)
 
+    def catch_up(self) -> None:
+        """A DAC sends nothing by itself."""
+
     def feed(self) -> None:
         """Transfers are made as the thread asks for them."""
 
@@ -210,11 +289,82 @@ class DacSide:
             self._carrier.close()
 
 
+class CanSide:
+    """Connects the CAN node."""
+
+    def __init__(self, driver: CanAmplifier, clock: Clock) -> None:
+        self._driver = driver
+        self._below = driver.bus.below if isinstance(driver.bus, CanView) else driver.bus
+        self._clock = clock
+        self._carrier: CanCarrier | None = None
+        self._memory: Any = None
+
+    def lacks(self) -> str:
+        if isinstance(self._clock, VirtualClock) or isinstance(self._below, CanCarrier):
+            return ""
+        return f"its bus ({type(self._below).__name__}) has no socket of single frames"
+
+    def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
+        from drivers.piezo.can_loop import memory_of  # numba
+
+        driver = self._driver
+        if isinstance(self._clock, VirtualClock):
+            self._carrier = virtual = VirtualCan(driver.bus, self._clock, fixed_ns)
+            calls = virtual.add_call(virtual.send), virtual.add_call(virtual.receive)
+            self._memory = memory_of(driver, virtual.CARRIER, fixed_ns, calls)
+            virtual.serve(self._memory.line)
+        else:
+            assert isinstance(self._below, CanCarrier)
+            self._carrier = self._below.for_thread((driver.status_id,))
+            self._memory = memory_of(driver, self._carrier.CARRIER, fixed_ns, (0, 0))
+        return self._memory
+
+    @property
+    def is_well(self) -> bool:
+        return self._driver.is_ready
+
+    def fileno(self) -> int:
+        assert self._carrier is not None
+        return self._carrier.fileno()
+
+    def take_over(self, is_read_back: bool) -> None:
+        from drivers.piezo.can_loop import FAILED, WRONG_LENGTH
+        from hal.can_wire import LENGTH_AT
+
+        words = self._memory.words
+        if not (failed := int(words[FAILED])):
+            return
+        words[FAILED] = 0
+        assert self._carrier is not None
+        if failed == WRONG_LENGTH:
+            self._driver.pending = self._driver.wrong_status(int(self._memory.line.received[LENGTH_AT]))
+        else:
+            self._driver.pending = self._carrier.failure(failed)
+
+    def catch_up(self) -> None:
+        if not isinstance(self._carrier, VirtualCan):
+            with contextlib.suppress(HalError):  # the driver's next call says it
+                self._driver.forget_received()
+
+    def feed(self) -> None:
+        """Frames are received as the thread asks for them."""
+
+    def flush(self) -> None:
+        """See ``feed``."""
+
+    def close(self) -> None:
+        self._memory = None
+        if self._carrier is not None:
+            self._carrier.close()
+
+
 def side_of(amplifier: AnalogOutput, clock: Clock) -> Side | None:
     """Return the side of ``amplifier``, None if it has no kernels."""
     inner = amplifier.inner if isinstance(amplifier, GuardedAmplifier) else amplifier
     if isinstance(inner, E727):
         return E727Side(inner, clock)
+    if isinstance(inner, CanAmplifier):
+        return CanSide(inner, clock)
     if isinstance(inner, DacOutput) and inner.CODE_AT and inner.VERIFY:
         return DacSide(amplifier if isinstance(amplifier, GuardedAmplifier) else inner, clock)
     return None

@@ -16,6 +16,7 @@ CAN_FORMS = (
     "slcan:///dev/ttyUSB0",
     "udp-multicast://239.74.163.2:43113",
     "virtual-can://name",
+    "unix-can:///path/to/socket",
 )
 
 
@@ -61,6 +62,7 @@ def open_can(uri: str, bitrate: int = 500_000, clock: Clock | None = None) -> Ca
     scheme, host, path, options = _split(uri, CAN_FORMS)
     openers: dict[str, Callable[[], CanBus]] = {}
     from hal.backends import python_can
+    from hal.backends.unix_can import UnixCan
 
     bench = clock or MonotonicClock()
     openers["socketcan"] = lambda: python_can.open_socketcan(host, bench)
@@ -69,11 +71,12 @@ def open_can(uri: str, bitrate: int = 500_000, clock: Clock | None = None) -> Ca
         path, bitrate, bench, wait_s=float(_integer(options.pop("wait_s", "0"), "wait_s", uri))
     )
     openers["udp-multicast"] = lambda: python_can.open_udp_multicast(*_group(host, uri), bench)
+    openers["unix-can"] = lambda: UnixCan(path, bench)
     if scheme not in openers:
         raise _unknown(uri, CAN_FORMS)
     if scheme != "slcan":
         _no_more(options, uri)
-    _need(path if scheme == "slcan" else host, uri, CAN_FORMS)
+    _need(path if scheme in ("slcan", "unix-can") else host, uri, CAN_FORMS)
     return openers[scheme]()
 
 

@@ -14,9 +14,11 @@ import os
 import select
 import socket
 import time
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 from hal.backends.can_package import import_can
+from hal.can_carrier import SOCKET
 from hal.contracts import Clock
 from hal.errors import BenchError, BusError, Closed, DeviceNotFound, Disconnected, HalError, HalTimeout
 from hal.types import CanFrame, CanStats, PortInfo, TimeSource
@@ -25,16 +27,17 @@ IP_MULTICAST_ALL = 49  # linux/in.h; the socket module has no name for it
 SO_RCVBUFFORCE = 33
 RECEIVE_BYTES = 4 << 20
 MARK_SEPARATOR = "#"
+Bus = TypeVar("Bus", bound="PythonCan")
 
 
 def open_virtual(name: str, clock: Clock) -> PythonCan:
     """Open a bus that carries frames between buses of the same name inside this process."""
-    return _open(f"virtual-can://{name}", clock, interface="virtual", channel=name)
+    return _open(f"virtual-can://{name}", clock, PythonCan, interface="virtual", channel=name)
 
 
-def open_socketcan(name: str, clock: Clock) -> PythonCan:
+def open_socketcan(name: str, clock: Clock) -> SocketCan:
     """Open a Linux CAN interface. ``ip link`` sets its bitrate."""
-    return _open(f"socketcan://{name}", clock, interface="socketcan", channel=name)
+    return _open(f"socketcan://{name}", clock, SocketCan, interface="socketcan", channel=name)
 
 
 def open_slcan(path: str, bitrate: int, clock: Clock, wait_s: float = 0.0) -> PythonCan:
@@ -42,6 +45,7 @@ def open_slcan(path: str, bitrate: int, clock: Clock, wait_s: float = 0.0) -> Py
     return _open(
         f"slcan://{path}",
         clock,
+        PythonCan,
         interface="slcan",
         channel=path,
         bitrate=bitrate,
@@ -55,6 +59,7 @@ def open_udp_multicast(group: str, port: int, clock: Clock) -> PythonCan:
     bus = _open(
         f"udp-multicast://{group}:{port}",
         clock,
+        PythonCan,
         interface="udp_multicast",
         channel=group,
         port=port,
@@ -66,7 +71,7 @@ def open_udp_multicast(group: str, port: int, clock: Clock) -> PythonCan:
     return bus
 
 
-def _open(uri: str, clock: Clock, *, marked: bool = False, **options: Any) -> PythonCan:
+def _open(uri: str, clock: Clock, kind: type[Bus], *, marked: bool = False, **options: Any) -> Bus:
     can = import_can()
     try:
         bus: Any = can.Bus(**options)
@@ -76,7 +81,7 @@ def _open(uri: str, clock: Clock, *, marked: bool = False, **options: Any) -> Py
         if isinstance(error.__cause__, ValueError):
             raise BenchError(str(error), device=uri) from error
         raise DeviceNotFound(f"does not open: {error}", device=uri) from error
-    return PythonCan(bus, can, uri, clock, marked)
+    return kind(bus, can, uri, clock, marked)
 
 
 class PythonCan:
@@ -207,3 +212,30 @@ class PythonCan:
         ):
             return Disconnected(f"the adapter has gone: {error}", device=self._uri)
         return BusError(str(error) or type(error).__name__, device=self._uri)
+
+
+class SocketCan(PythonCan):
+    """A Linux CAN interface, whose raw sockets carry ``struct can_frame``."""
+
+    CARRIER = SOCKET
+
+    def for_thread(self, can_ids: Iterable[int]) -> SocketCan:
+        """See ``CanCarrier``: a socket of its own, whose filter lets ``can_ids`` pass."""
+        bus = open_socketcan(self._bus.channel, self._clock)
+        bus.receive_only(can_ids)
+        return bus
+
+    def receive_only(self, can_ids: Iterable[int]) -> None:
+        """Let the kernel pass base frames with ``can_ids`` alone, and never wait in a read or write."""
+        self._bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in can_ids])
+        os.set_blocking(self.fileno(), False)
+
+    def fileno(self) -> int:
+        """See ``CanCarrier``."""
+        return int(self._bus.fileno())
+
+    def failure(self, code: int) -> HalError:
+        """See ``CanCarrier``."""
+        if -code in (errno.EAGAIN, errno.ENOBUFS):
+            return HalTimeout("the bus takes no more frames: its queue is full", device=self._uri)
+        return self._failed(OSError(-code, os.strerror(-code)))

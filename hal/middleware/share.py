@@ -16,7 +16,7 @@ QUEUE_FRAMES = 1024
 
 
 class SharedCan:
-    """Owns the bus. ``unclaimed`` counts frames that no view receives."""
+    """Owns the bus. Views receive base frames; ``unclaimed`` counts frames that no view receives."""
 
     def __init__(self, bus: CanBus) -> None:
         self.unclaimed = 0
@@ -38,7 +38,7 @@ class SharedCan:
         frame = self._bus.recv(timeout_s)
         if frame is None:
             return False
-        view = self._views.get(frame.can_id)
+        view = None if frame.extended else self._views.get(frame.can_id)
         if view is None:
             self.unclaimed += 1
         else:
@@ -59,6 +59,11 @@ class CanView:
         self._rx = 0
         self._tx = 0
         self._dropped = 0
+
+    @property
+    def below(self) -> CanBus:
+        """The bus that is shared."""
+        return self._bus
 
     def accept(self, frame: CanFrame) -> None:
         """Queue ``frame``; the owner calls this. A full queue drops its oldest frame and counts it."""

@@ -7,15 +7,19 @@ import select
 import socket
 import tty
 from collections.abc import Iterator
+from pathlib import Path
 
 import can
 import pytest
 
 from hal.backends import open_can
+from hal.backends.unix_can import UnixCan
 from hal.clock import MonotonicClock
 from hal.contracts import CanBus
-from hal.errors import BenchError, DeviceNotFound, Disconnected
+from hal.errors import BenchError, DeviceNotFound, Disconnected, HalTimeout
 from hal.types import CanFrame, CanStats, PortInfo
+from sim_devices.transports.can_hub import EXTENDED, CanHub
+from sim_devices.transports.can_socket import CanSocketServer
 from tests.contract.can_contract import CanContract, CanPair, content
 
 GROUP = "239.74.163.2"
@@ -158,6 +162,109 @@ class TestSlcan(CanContract):
         os.close(slave)
 
 
+class FarNode:
+    """A node of an emulated bus, which the test pumps: what it hears is kept, what it sends goes to the host."""
+
+    def __init__(self, folder: Path) -> None:
+        self._hub = CanHub(10**9)
+        self._hub.attach(self)
+        self.server = CanSocketServer(self._hub, folder / "can.sock")
+        self._t_ns = 0
+        self._heard: list[CanFrame] = []
+        self._own: list[tuple[int, bytes]] = []
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> None:
+        self._heard.append(CanFrame(can_id & ~EXTENDED, data, bool(can_id & EXTENDED)))
+
+    def take(self) -> list[tuple[int, bytes]]:
+        own, self._own = self._own, []
+        return own
+
+    def next_event_ns(self) -> int | None:
+        return None
+
+    def advance_to(self, t_ns: int) -> None:
+        pass
+
+    def send(self, frame: CanFrame, timeout_s: float) -> None:
+        while self._pump(0.0):  # accepts who has connected
+            pass
+        self._own.append((frame.can_id | (EXTENDED if frame.extended else 0), frame.data))
+        for _ in range(2):
+            self._advance()
+
+    def recv(self, timeout_s: float) -> CanFrame | None:
+        while not self._heard and self._pump(timeout_s):
+            pass
+        return self._heard.pop(0) if self._heard else None
+
+    def _pump(self, timeout_s: float) -> bool:
+        ready = select.select(self.server.filenos(), (), (), timeout_s)[0]
+        for fileno in ready:
+            self.server.pump(fileno, self._t_ns)
+        self._advance()
+        return bool(ready)
+
+    def _advance(self) -> None:
+        self._t_ns += 1_000_000_000
+        self._hub.advance_to(self._t_ns)
+
+    def stats(self) -> CanStats:
+        return CanStats()
+
+    def info(self) -> PortInfo:
+        return PortInfo("test://", "far end", emulated=True)
+
+    def close(self) -> None:
+        self.server.close()
+
+
+class TestUnix(CanContract):
+    burst = 100
+    """As many as a Unix socket holds for a host that does not read (net.unix.max_dgram_qlen does not bind it)."""
+
+    @pytest.fixture
+    def pair(self, tmp_path: Path) -> Iterator[CanPair]:
+        far = FarNode(tmp_path)
+        clock = MonotonicClock()
+        bus = open_can(far.server.uri, 500_000, clock)
+        yield CanPair(bus, far, clock)
+        bus.close()
+        far.close()
+
+    def test_a_second_connection_hears_the_node_and_not_the_first(self, pair: CanPair):
+        assert isinstance(pair.bus, UnixCan)
+        second = pair.bus.for_thread(())
+        pair.bus.send(CanFrame(0x100, b"mine"), 0.5)
+        assert content(pair.far.recv(2.0)) == (0x100, b"mine", False)
+        pair.far.send(CanFrame(0x121, b"all"), 0.5)
+        assert content(pair.bus.recv(2.0)) == content(second.recv(2.0)) == (0x121, b"all", False)
+        assert second.recv(0.01) is None
+        second.close()
+
+    def test_a_host_that_does_not_read_loses_frames_and_holds_nobody_up(self, pair: CanPair):
+        assert isinstance(pair.far, FarNode)
+        for _ in range(100_000):
+            pair.far.send(CanFrame(0x121, b""), 0.0)
+            if pair.far.server.lost:
+                break
+        assert pair.far.server.lost == 1
+
+    def test_a_world_that_does_not_read_is_a_timeout(self, pair: CanPair):
+        def send_many() -> None:
+            for _ in range(100_000):
+                pair.bus.send(CanFrame(0x120, b""), 0.0)
+
+        with pytest.raises(HalTimeout, match="queue is full"):
+            send_many()
+
+    def test_a_world_that_has_gone_is_a_disconnect(self, pair: CanPair):
+        pair.far.recv(0.0)
+        pair.far.close()
+        with pytest.raises(Disconnected):
+            pair.bus.recv(0.1)
+
+
 def test_no_socketcan_here_or_no_such_interface():
     with pytest.raises(DeviceNotFound, match="socketcan://nosuch0"):
         open_can("socketcan://nosuch0", 500_000)
@@ -178,7 +285,15 @@ def test_impossible_bitrate():
 
 @pytest.mark.parametrize(
     "uri",
-    ["can0", "pcan://1", "socketcan://", "udp-multicast://239.1.1.1", "udp-multicast://g:p", "virtual-can://x?a=1"],
+    [
+        "can0",
+        "pcan://1",
+        "socketcan://",
+        "udp-multicast://239.1.1.1",
+        "udp-multicast://g:p",
+        "virtual-can://x?a=1",
+        "unix-can://host",
+    ],
 )
 def test_uris_that_are_refused(uri: str):
     with pytest.raises(BenchError):

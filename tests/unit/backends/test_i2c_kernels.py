@@ -18,10 +18,10 @@ from hal.i2c_kernels import (
     Transfer,
     new_transfer,
     ops_of,
-    python_call,
     transfer,
     write_at,
 )
+from hal.python_call import python_call
 from hal.types import I2cRead, I2cWrite
 
 OPS = (I2cWrite(b"\x10\xaa\xbb"), I2cWrite(b"\x01"), I2cRead(4))

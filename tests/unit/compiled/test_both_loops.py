@@ -19,11 +19,11 @@ from firmware_py.compiled.memory import BEAT_LIMIT_NS
 from firmware_py.recording.reader import Recording
 from firmware_py.run_request import RunRequest
 from hal.contracts import Clock
-from hal.middleware.faults import FaultI2c, FaultPlan, FaultSerial
+from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
 from tools.research.faults.carriers import SocketPort
 
 BENCHES = Path(__file__).parents[3] / "benches"
-SERIAL, DEFAULT = (BENCHES / f"{name}.toml" for name in ("micron-e727", "micron"))
+SERIAL, DEFAULT, CAN = (BENCHES / f"{name}.toml" for name in ("micron-e727", "micron", "micron-can"))
 SECONDS = 0.6
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -35,7 +35,8 @@ def run(
 
     def wrap(bus: str, port: Any, clock: Clock) -> Any:
         if not hasattr(port, "drain_input"):
-            return FaultI2c(port, clock, plans[bus]) if bus in plans else port
+            sabotaged = FaultI2c if hasattr(port, "transfer") else FaultCan
+            return sabotaged(port, clock, plans[bus]) if bus in plans else port
         return SocketPort(FaultSerial(port, clock, plans[bus]) if bus in plans else port)
 
     file = folder / f"{compiled}.mcap"
@@ -63,7 +64,7 @@ def compare(folder: Path, plans: dict[str, FaultPlan], bench: Path = SERIAL) -> 
     return compiled[0]
 
 
-@pytest.mark.parametrize("bench", [SERIAL, DEFAULT], ids=lambda bench: bench.stem)
+@pytest.mark.parametrize("bench", [SERIAL, DEFAULT, CAN], ids=lambda bench: bench.stem)
 def test_a_quiet_run(tmp_path: Path, bench: Path):
     outcome = compare(tmp_path, {}, bench)
     assert outcome["loop"]["kind"] == "compiled"
@@ -71,7 +72,7 @@ def test_a_quiet_run(tmp_path: Path, bench: Path):
     assert outcome["safe_state"]["normal"]
 
 
-@pytest.mark.parametrize("bench", [SERIAL, DEFAULT], ids=lambda bench: bench.stem)
+@pytest.mark.parametrize("bench", [SERIAL, DEFAULT, CAN], ids=lambda bench: bench.stem)
 def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Path):
     """Python's heartbeat counts as stopped for one entry: neutral without Python, a hold, and on."""
     feed = CompiledMicron._feed  # pyright: ignore[reportPrivateUsage]
@@ -143,3 +144,18 @@ def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
 )
 def test_transfers_that_fail(tmp_path: Path, plan: FaultPlan):
     compare(tmp_path, {"i2c0": plan}, DEFAULT)
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        FaultPlan(seed=3, loss=0.3, corruption=0.1, from_s=0.7),
+        FaultPlan(seed=3, truncation=0.2, duplication=0.2, reorder=0.2, from_s=0.7),
+        FaultPlan(babble_hz=4000.0, from_s=0.7),
+        FaultPlan(silent_after_s=0.8),
+        FaultPlan(bus_off_after_s=0.8),
+        FaultPlan(disconnect_after_s=0.9),
+    ],
+)
+def test_frames_that_fail(tmp_path: Path, plan: FaultPlan):
+    compare(tmp_path, {"can0": plan}, CAN)

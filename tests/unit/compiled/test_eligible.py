@@ -19,7 +19,7 @@ def reasons(name: str) -> str:
     return "; ".join(reasons_against_bench(load_bench(BENCHES / f"{name}.toml"), "realtime"))
 
 
-@pytest.mark.parametrize("bench", ["micron", "micron-e727"])
+@pytest.mark.parametrize("bench", ["micron", "micron-e727", "micron-can"])
 def test_these_benches_can(bench: str):
     assert reasons(bench) == ""
     check_compiled(load_bench(BENCHES / f"{bench}.toml"), "realtime")
@@ -28,13 +28,28 @@ def test_these_benches_can(bench: str):
 @pytest.mark.parametrize(
     ("bench", "what"),
     [
-        ("micron-can", "device.piezo: its driver can_amplifier has no kernels"),
         ("micron-eight", "8 accelerometer axes"),
         ("endoscope", "an endoscope's loop is Python"),
     ],
 )
 def test_others_say_which_device_and_why(bench: str, what: str):
     assert what in reasons(bench)
+
+
+@pytest.mark.parametrize(
+    ("uri", "answer"),
+    [
+        ("socketcan://can0", ""),
+        ("slcan:///dev/ttyUSB0", "device.piezo: its bus slcan:///dev/ttyUSB0 has no socket"),
+        ("sim://can0?via=slcan", "device.piezo: its bus sim://can0?via=slcan has no socket"),
+    ],
+)
+def test_a_can_bus_needs_a_socket_of_single_frames(tmp_path: Path, uri: str, answer: str):
+    file = tmp_path / "bench.toml"
+    file.write_text((BENCHES / "micron-can.toml").read_text().replace("sim://can0", uri))
+    found = "; ".join(reasons_against_bench(load_bench(file), "realtime"))
+    assert found.startswith(answer)
+    assert bool(found) == bool(answer)
 
 
 def test_emulated_time_and_injected_faults_are_python():
@@ -44,7 +59,7 @@ def test_emulated_time_and_injected_faults_are_python():
 
 def test_asked_for_it_is_bad_input(tmp_path: Path):
     record = tmp_path / "run.mcap"
-    bench = str(BENCHES / "micron-can.toml")
+    bench = str(BENCHES / "micron-eight.toml")
     result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", "--compiled", "--record", str(record)])
     assert result.exit_code == 2
     assert not record.exists()

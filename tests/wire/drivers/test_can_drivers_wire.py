@@ -12,6 +12,7 @@ from drivers.can_frames import HostHeartbeat, crc8_j1850
 from drivers.can_telemetry import CanTelemetry
 from drivers.dbc import load_database
 from drivers.piezo.can_amplifier import CanAmplifier
+from drivers.piezo.can_node import ACKNOWLEDGED, COUNTER
 from hal.clock import VirtualClock
 from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip
 from hal.types import CanFrame, ChannelInfo
@@ -87,7 +88,7 @@ def armed(**options: float) -> tuple[CanAmplifier, ScriptedCan, Node, VirtualClo
 
 def test_setpoint_frame():
     amplifier, can, _, _ = armed(slew_V_per_s=1e9)
-    counter = amplifier._counter
+    counter = amplifier.node.words[COUNTER]
     assert amplifier.write(np.array([0.0, 100.0, 50.0])) == 0
     frame = next(data for can_id, data in can.sent if can_id == 0x120)
     body = bytes.fromhex("0000ffff0080") + bytes((counter,))  # 50 V = 32767.5, rounded up
@@ -371,7 +372,7 @@ class TestDbc:
         can.arrive(0x121, data.hex())
         amplifier.poll()
         assert amplifier.measured_V == pytest.approx([10.0, 20.0, 90.0], abs=1e-3)
-        assert (amplifier.state, amplifier._acknowledged) == (2, 77)
+        assert (amplifier.state, amplifier.node.words[ACKNOWLEDGED]) == (2, 77)
 
 
 def test_impossible_neutral():
