@@ -85,7 +85,7 @@ def identifier(line: CanLine) -> int:
     word = 0
     for i in range(IDENTIFIER_BYTES):
         word |= np.int64(line.received[i]) << 8 * i
-    return word
+    return int(word)
 
 
 @kernel

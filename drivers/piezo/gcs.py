@@ -107,6 +107,8 @@ class GcsLink:
         self._clock = clock
         self.timeout_s = timeout_s
         self.memory = new_memory()
+        self._stuck_ns = NEVER
+        """When the port took something last, since it has not taken all."""
         self._buf = memoryview(bytearray(256))
 
     # set-up: may wait, bounded
@@ -169,9 +171,13 @@ class GcsLink:
             self.memory.asked_ns[0] = self._clock.now_ns()
 
     def take_error(self) -> None:
-        """Read what has come. Raises ``ProtocolError`` for a latched error, ``HalTimeout`` for a late answer."""
-        if self._is_stuck:
-            self._push()
+        """Read what has come. Raises ``ProtocolError`` for a latched error, ``HalTimeout`` for a late answer and for a
+        port that takes nothing for as long."""
+        if self._is_stuck and not self._push() and self._clock.now_ns() - self._stuck_ns > self.timeout_s * 1e9:
+            raise HalTimeout(
+                f"the port has taken nothing for {self.timeout_s} s: check the cable and the controller",
+                device=self.name,
+            )
         if not self._awaits:
             return
         n = self._port.read_into(self._buf, 0.0)
@@ -223,8 +229,11 @@ class GcsLink:
             self._port.write(data, 0.0)
         except HalTimeout as stuck:
             keep_unsent(memory, data, stuck.partial, len(data))
+            if self._stuck_ns == NEVER or stuck.partial > 0:
+                self._stuck_ns = self._clock.now_ns()
             return False
         memory.sizes[UNSENT] = 0
+        self._stuck_ns = NEVER
         return True
 
     def _check(self, answer: str, text: str) -> None:

@@ -34,6 +34,7 @@ class FaultCan:
         if faults.silent():
             self.counts.silenced += 1
             return
+        faults.wait_for_room(timeout_s)
         self._bus.send(frame, timeout_s)
 
     def recv(self, timeout_s: float) -> CanFrame | None:

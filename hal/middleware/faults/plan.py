@@ -11,7 +11,7 @@ import random
 from dataclasses import dataclass, replace
 
 from hal.contracts import Clock
-from hal.errors import Disconnected
+from hal.errors import Disconnected, HalTimeout
 from hal.types import PortInfo
 
 
@@ -23,6 +23,7 @@ class FaultPlan:
     ``reorder`` are per read (serial) or frame (CAN). ``write_corruption`` flips a bit of what is sent to an I2C
     device. ``bus_off_after_s`` (CAN) lets every send fail; ``babble_hz`` floods the bus with frames of the highest
     priority; ``error_frames_hz`` counts as a broken line does. ``reconnect_after_s`` ends a disconnection.
+    ``full_after_s`` (serial, CAN): the queue of what is sent is full for ``full_for_s``, and takes nothing.
     """
 
     seed: int = 0
@@ -44,13 +45,16 @@ class FaultPlan:
     bus_off_after_s: float | None = None
     babble_hz: float = 0.0
     error_frames_hz: float = 0.0
+    full_after_s: float | None = None
+    full_for_s: float = math.inf
 
 
 @dataclass(slots=True)
 class FaultCounts:
     """Holds the counts of the faults that were injected.
 
-    ``silenced`` counts the bytes, transfers or frames that silence suppressed."""
+    ``silenced`` counts the bytes, transfers or frames that silence suppressed, ``refused`` the writes for which there
+    was no room."""
 
     lost: int = 0
     corrupted: int = 0
@@ -60,6 +64,7 @@ class FaultCounts:
     delayed: int = 0
     nacked: int = 0
     silenced: int = 0
+    refused: int = 0
     babbled: int = 0
     error_frames: int = 0
     disconnected: bool = False
@@ -102,6 +107,18 @@ class Injector:
     def silent(self) -> bool:
         after_s = self.plan.silent_after_s
         return after_s is not None and after_s <= self.now_s() < after_s + self.plan.silent_for_s
+
+    def full(self) -> bool:
+        """Return True while there is no room for what is sent."""
+        after_s = self.plan.full_after_s
+        return after_s is not None and after_s <= self.now_s() < after_s + self.plan.full_for_s
+
+    def wait_for_room(self, timeout_s: float) -> None:
+        """Wait as a write does that finds no room. Raises ``HalTimeout``: the fault outlives the wait."""
+        if self.full():
+            self._clock.sleep_until_ns(self._clock.now_ns() + round(timeout_s * 1e9))
+            self.counts.refused += 1
+            raise HalTimeout(f"nothing sent in {timeout_s} s: the queue is full (injected fault)", device=self._uri)
 
     def hold_up(self) -> None:
         if self.happens(self.plan.delay):

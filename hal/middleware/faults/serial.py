@@ -76,7 +76,13 @@ class FaultSerial:
         if self._faults.silent():
             self.counts.silenced += len(data)
             return
+        self._faults.wait_for_room(timeout_s)
         self._port.write(data, timeout_s)
+
+    @property
+    def is_full(self) -> bool:
+        """True while a write finds no room."""
+        return self._faults.full()
 
     def drain_input(self) -> int:
         dropped = len(self._held)

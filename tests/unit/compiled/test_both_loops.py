@@ -90,7 +90,7 @@ def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatc
         sync(loop)
         words = loop._words  # pyright: ignore[reportPrivateUsage]
         if words[BEAT_LIMIT_NS] < 0:
-            commanded_V.append(list(loop.run.output.commanded_V))  # pyright: ignore[reportPrivateUsage]
+            commanded_V.append(list(loop.run.output.commanded_V))  # pyright: ignore[reportOptionalMemberAccess]
             words[BEAT_LIMIT_NS] = 100_000_000
 
     monkeypatch.setattr(CompiledMicron, "_feed", feed_late)
@@ -126,6 +126,8 @@ def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
         ("e7270", FaultPlan(seed=3, corruption=0.2, from_s=0.8)),
         ("e7270", FaultPlan(silent_after_s=0.8)),
         ("e7270", FaultPlan(disconnect_after_s=0.9)),
+        ("e7270", FaultPlan(full_after_s=0.7, full_for_s=0.2)),
+        ("e7270", FaultPlan(full_after_s=0.7)),
     ],
 )
 def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
@@ -154,6 +156,8 @@ def test_transfers_that_fail(tmp_path: Path, plan: FaultPlan):
         FaultPlan(babble_hz=4000.0, from_s=0.7),
         FaultPlan(silent_after_s=0.8),
         FaultPlan(bus_off_after_s=0.8),
+        FaultPlan(full_after_s=0.8),
+        FaultPlan(full_after_s=0.8, full_for_s=0.05),
         FaultPlan(disconnect_after_s=0.9),
     ],
 )

@@ -160,6 +160,23 @@ def test_an_answer_that_is_late_is_a_lost_link():
     assert caught.value.device == "piezo"
 
 
+def test_a_port_that_takes_nothing_for_the_timeout_is_told():
+    link, line, clock = loop(room=3)
+    assert link.send(b"SVA 1 2\n")
+    clock.burn_ns(90 * MS)
+    link.take_error()
+    line.room = 1  # it moves: the time begins anew
+    link.take_error()
+    clock.burn_ns(100 * MS)
+    link.take_error()
+    clock.burn_ns(MS)
+    with pytest.raises(HalTimeout, match=r"taken nothing for 0\.1 s"):
+        link.take_error()
+    line.room = 1000
+    link.take_error()
+    assert line.sent == b"SVA 1 2\n"
+
+
 def test_an_error_cannot_be_asked_for_behind_a_stuck_command():
     link, line, _ = loop(room=2)
     link.send(b"MOV 1 5\n")

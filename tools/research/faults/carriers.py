@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import socket
@@ -20,12 +21,14 @@ def _new_pair() -> tuple[socket.socket, socket.socket]:
 
 class SocketPort:
     """``Fed`` over a port of virtual time: what the device sends passes a socket pair, and so does what is written to
-    its descriptor. A read or write of Python goes around it, after what waits there."""
+    its descriptor. A read or write of Python goes around it, after what waits there. While the port takes nothing, the
+    descriptor does neither: the socket's queue is full."""
 
     def __init__(self, port: SerialPort) -> None:
         self._port = port
         self._near, self._far = _new_pair()
         self._room = memoryview(bytearray(1 << 16))
+        self._is_filled = False
 
     def leave_to_parent(self) -> None:
         """Go on over a pair of this process alone, with a copy of what waits in the one that a fork has shared."""
@@ -43,6 +46,7 @@ class SocketPort:
         return self._near.fileno()
 
     def feed(self, timeout_s: float) -> None:
+        self._fill_or_empty()
         if not select.select([self._near], [], [], 0.0)[0]:
             try:
                 n = self._port.read_into(self._room, timeout_s)
@@ -51,7 +55,19 @@ class SocketPort:
                 return
             self._far.sendall(self._room[:n])
 
+    def _fill_or_empty(self) -> None:
+        if getattr(self._port, "is_full", False) == self._is_filled:
+            return
+        self._is_filled = not self._is_filled
+        with contextlib.suppress(BlockingIOError):
+            while self._is_filled:
+                self._near.send(bytes(1 << 16))
+        while not self._is_filled and select.select([self._far], [], [], 0.0)[0]:
+            self._far.recv(1 << 16)
+
     def flush(self) -> None:
+        if self._is_filled:
+            return
         while self._far.fileno() >= 0 and select.select([self._far], [], [], 0.0)[0]:
             for line in self._far.recv(4096).splitlines(keepends=True):
                 self._port.write(line, 0.0)  # one by one, as the driver writes them: a device draws its delays by write
