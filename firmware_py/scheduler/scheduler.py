@@ -134,9 +134,11 @@ class Scheduler:
         self._run(due, info, scan_info)
         return info
 
-    def _with_waiting(self, due: tuple[_LiveTask, ...]) -> tuple[_LiveTask, ...]:
-        """Return the due tasks followed by the deferred ones. A deferred task that is due again runs once."""
-        waiting, self._waiting = self._waiting, []
+    def _with_waiting(self, due: tuple[_LiveTask, ...], others: Collection[str] = ()) -> tuple[_LiveTask, ...]:
+        """Return the due tasks followed by the deferred ones, except ``others``, which go on waiting. A deferred task
+        that is due again runs once."""
+        waiting = [task for task in self._waiting if task.spec.name not in others]
+        self._waiting = [task for task in self._waiting if task.spec.name in others]
         for task in waiting:
             if task in due:
                 task.skipped += 1
@@ -187,7 +189,7 @@ class Scheduler:
                 due.append(task)
         tasks = tuple(due)
         if in_tick and self._waiting:
-            tasks = self._with_waiting(tasks)
+            tasks = self._with_waiting(tasks, others)
         self._run(tasks, info, info, beside=True, may_put_off=in_tick)
 
     def next_beside(self, k: int, others: Collection[str]) -> int:

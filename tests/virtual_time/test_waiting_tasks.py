@@ -79,3 +79,14 @@ def test_a_reset_counts_anew_what_was_put_off(bench: Bench):
     bench.run(scheduler, 3, HostTicker(bench.clock, MS, t0_ns=0, k0=1))
     assert scheduler.snapshot().task("slow").put_off == 0
     assert bench.ran("slow") == [1]
+
+
+def test_what_a_compiled_loop_has_put_off_in_a_tick_waits_for_the_next_one(bench: Bench):
+    """The rest of the tick must not ask again: its patience would be used up twice as fast, or it would run at once."""
+    scheduler = waiting_pair(bench, lambda k: 100.0, may_wait=2)
+    scheduler.defer("slow", 1)
+    scheduler.run_beside(0, 0, 0, ("command", "slow"), in_tick=True)
+    assert bench.ran("slow") == []
+    assert scheduler.is_deferred("slow")
+    scheduler.run_beside(MS, 1, 1, ("command",), in_tick=True)
+    assert bench.ran("slow") == [1]
