@@ -1,4 +1,4 @@
-"""Parts that the CAN drivers share: the checksum of setpoints and the heartbeat of this host."""
+"""Parts that the CAN drivers share: the heartbeat of this host."""
 
 from __future__ import annotations
 
@@ -13,29 +13,6 @@ from hal.wire_bits import can_bits
 
 HEARTBEAT_PERIOD_NS = 20_000_000
 HEARTBEAT_BYTES = 1
-
-
-def _crc_table() -> bytes:
-    table = bytearray(256)
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1D if crc & 0x80 else crc << 1) & 0xFF
-        table[byte] = crc
-    return bytes(table)
-
-
-CRC_TABLE = _crc_table()
-"""CRC-8/SAE-J1850 of each byte, as ``crc8_j1850`` uses it."""
-
-
-def crc8_j1850(data: bytes) -> int:
-    """Return the CRC-8/SAE-J1850: polynomial 0x1D, start 0xFF, result inverted; "123456789" gives 0x4B."""
-    table = CRC_TABLE
-    crc = 0xFF
-    for byte in data:
-        crc = table[crc ^ byte]
-    return crc ^ 0xFF
 
 
 BEAT_DUE_NS, BEAT_STATE, BEATS, BEAT_WORDS = range(4)

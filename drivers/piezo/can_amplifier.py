@@ -92,12 +92,12 @@ class CanAmplifier(GuardedOutput):
 
     @property
     def state(self) -> int:
-        """What the node has said of itself: DISARMED, ARMED, SAFE_RAMP or FAULT."""
+        """Return the state that the node has reported: DISARMED, ARMED, SAFE_RAMP or FAULT."""
         return self.node.words[STATE]
 
     @property
     def measured_V(self) -> Float64Array:
-        """What the node has measured (3,) in V, not a number before its first STATUS."""
+        """Return the voltages (3,) in V that the node has measured, not a number before its first STATUS."""
         return np.array(self.node.measured_V)
 
     @property

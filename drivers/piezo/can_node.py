@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.can_frames import CRC_TABLE
-
 CHANNELS = 3
 FULL_V = 100.0
 CODES_PER_V = 65535.0 / FULL_V
@@ -33,6 +31,20 @@ STATE, COUNTER, ACKNOWLEDGED, STATUS_NS, SAFE_STEPS, ASKED_NS, WORDS = range(7)
 acknowledged, when that came, steps since the safe state was asked for, and when that was."""
 WELL, SILENT, LEFT, LAGS = range(4)
 """What ``link_fault`` finds: nothing, no STATUS, a node that is not armed, set points that are not accepted."""
+
+
+def _crc_table() -> bytes:
+    table = bytearray(256)
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D if crc & 0x80 else crc << 1) & 0xFF
+        table[byte] = crc
+    return bytes(table)
+
+
+CRC_TABLE = _crc_table()
+"""CRC-8/SAE-J1850 of each byte: polynomial 0x1D. A checksum begins with 0xFF and is inverted at the end."""
 
 
 class NodeMemory(NamedTuple):

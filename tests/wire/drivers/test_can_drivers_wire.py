@@ -8,11 +8,11 @@ import cantools.database
 import numpy as np
 import pytest
 
-from drivers.can_frames import HostHeartbeat, crc8_j1850
+from drivers.can_frames import HostHeartbeat
 from drivers.can_telemetry import CanTelemetry
 from drivers.dbc import load_database
 from drivers.piezo.can_amplifier import CanAmplifier
-from drivers.piezo.can_node import ACKNOWLEDGED, COUNTER
+from drivers.piezo.can_node import ACKNOWLEDGED, COUNTER, encode_setpoint, new_node
 from hal.clock import VirtualClock
 from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip
 from hal.types import CanFrame, ChannelInfo
@@ -35,14 +35,17 @@ def crc_bit_by_bit(data: bytes) -> int:
     return register ^ 0xFF
 
 
-def test_crc_check_value():
-    assert crc8_j1850(b"123456789") == 0x4B
-    assert crc8_j1850(b"") == 0x00
+def test_the_shift_register_gives_the_check_value():
+    assert crc_bit_by_bit(b"123456789") == 0x4B
 
 
-@pytest.mark.parametrize("data", [bytes(7), bytes(range(7)), b"\xff" * 7, b"\x00\x80\x00\x80\x00\x80\x2a"])
-def test_crc_against_the_shift_register(data: bytes):
-    assert crc8_j1850(data) == crc_bit_by_bit(data)
+@pytest.mark.parametrize("volts", [(0.0, 0.0, 0.0), (100.0, 100.0, 100.0), (1.0, 20.0, 50.0)])
+@pytest.mark.parametrize("counter", [0, 42, 255])
+def test_the_checksum_of_a_setpoint_is_that_of_the_shift_register(volts: tuple[float, float, float], counter: int):
+    node = new_node()
+    node.words[COUNTER] = counter
+    encode_setpoint(node, volts)
+    assert node.setpoint[7] == crc_bit_by_bit(bytes(node.setpoint[:7]))
 
 
 class Node:

@@ -88,7 +88,7 @@ def test_i2c_over_the_socket(world: ProcessWorld) -> None:
     bus.close()
 
 
-def test_can_over_multicast_carries_the_stop_button(world: ProcessWorld) -> None:
+def test_can_over_a_socket_carries_the_stop_button(world: ProcessWorld) -> None:
     bus = open_can(world.endpoint("can0"))
     bus.send(CanFrame(0x200, bytes(8)), 1.0)
     world.inject("press")
