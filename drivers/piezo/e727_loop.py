@@ -28,7 +28,8 @@ from drivers.piezo.gcs import (
     take_answer,
 )
 from hal.compiled import kernel
-from hal.fd_kernels import EAGAIN, read_fd, write_fd
+from hal.fd_kernels import POLLIN, poll_word, read_fd, wait_fds, write_fd
+from hal.scratch import stack_index
 
 if TYPE_CHECKING:
     from drivers.piezo.e727 import E727
@@ -97,11 +98,13 @@ def is_link_well(out: OutputMemory, fd: int, now_ns: int) -> bool:
         return False
     if link.asked_ns[0] == NEVER:
         return True
-    n = read_fd(fd, out.answer, 0, len(out.answer))
-    if n <= 0 and n != -EAGAIN:
-        return False
-    n = max(n, 0)
-    verdict = NOTHING
+    polls = stack_index(1)  # pyright: ignore[reportCallIssue]
+    polls[0] = poll_word(fd, POLLIN)
+    n, verdict = 0, NOTHING
+    if wait_fds(polls, 0) != 0:  # a read of a tty that has nothing gives 0 bytes, as one that was hung up does
+        n = read_fd(fd, out.answer, 0, len(out.answer))
+        if n <= 0:
+            return False
     if n > 0 or link.sizes[LINE] > 0:
         verdict = link_take(link, out.answer, n)
     if verdict == NOTHING:
