@@ -140,6 +140,7 @@ def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
         FaultPlan(seed=3, loss=0.02, from_s=0.7),
         FaultPlan(seed=3, corruption=0.02, from_s=0.7),
         FaultPlan(seed=3, delay=0.05, delay_s=0.001, from_s=0.7),
+        FaultPlan(delay=1.0, delay_s=0.001, from_s=0.7),  # what is put off in a tick waits for the next one
         FaultPlan(silent_after_s=0.9, silent_for_s=0.1),
         FaultPlan(disconnect_after_s=0.9),
     ],

@@ -20,7 +20,8 @@ from tools.research.faults.carriers import SocketPort
 BENCHES = Path(__file__).parents[3] / "benches"
 NEUTRAL_V = 50.0
 CLOSE_V = 0.02
-FULL_S = 0.8
+FULL_S = 4.0
+"""When the queue is full: the estimator has learned by then, and the outputs are away from neutral."""
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
@@ -44,7 +45,7 @@ def run(bench: str, bus: str, plan: FaultPlan, *, compiled: bool) -> tuple[dict[
         world: Any = opened.world
         world.world.faults.on_demand = note
 
-    request = RunRequest(BENCHES / f"{bench}.toml", 1.2, pace="virtual", compiled=compiled)
+    request = RunRequest(BENCHES / f"{bench}.toml", FULL_S + 0.8, pace="virtual", compiled=compiled)
     outcome, _ = run_in_process(request, on_open=on_open, wrap=wrap)
     assert ports[0].counts.refused > 0
     return outcome, changes
