@@ -158,8 +158,8 @@ class GcsLink:
 
     def send(self, data: bytes) -> bool:
         """Hand ``data`` to the port without waiting. False when an earlier command is still stuck: then nothing
-        of ``data`` was taken."""
-        if self._is_stuck and not self._push():
+        of ``data`` was taken. Raises ``HalTimeout`` when the port has taken nothing for ``timeout_s``."""
+        if not self._is_free():
             return False
         keep_unsent(self.memory, data, 0, len(data))
         self._push()
@@ -173,11 +173,7 @@ class GcsLink:
     def take_error(self) -> None:
         """Read what has come. Raises ``ProtocolError`` for a latched error, ``HalTimeout`` for a late answer and for a
         port that takes nothing for as long."""
-        if self._is_stuck and not self._push() and self._clock.now_ns() - self._stuck_ns > self.timeout_s * 1e9:
-            raise HalTimeout(
-                f"the port has taken nothing for {self.timeout_s} s: check the cable and the controller",
-                device=self.name,
-            )
+        self._is_free()
         if not self._awaits:
             return
         n = self._port.read_into(self._buf, 0.0)
@@ -198,6 +194,16 @@ class GcsLink:
         memory.sizes[LINE] = len(rest)
         memory.asked_ns[0] = NEVER
         self._check(answer.decode("latin-1"), "an earlier command")
+
+    def _is_free(self) -> bool:
+        if not self._is_stuck or self._push():
+            return True
+        if self._clock.now_ns() - self._stuck_ns > self.timeout_s * 1e9:
+            raise HalTimeout(
+                f"the port has taken nothing for {self.timeout_s} s: check the cable and the controller",
+                device=self.name,
+            )
+        return False
 
     @property
     def is_well(self) -> bool:

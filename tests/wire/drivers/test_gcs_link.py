@@ -172,6 +172,8 @@ def test_a_port_that_takes_nothing_for_the_timeout_is_told():
     clock.burn_ns(MS)
     with pytest.raises(HalTimeout, match=r"taken nothing for 0\.1 s"):
         link.take_error()
+    with pytest.raises(HalTimeout, match=r"taken nothing for 0\.1 s"):
+        link.send(b"SVA 1 3\n")  # a step of the ramp, which would be tried for ever
     line.room = 1000
     link.take_error()
     assert line.sent == b"SVA 1 2\n"
