@@ -126,8 +126,6 @@ def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
         ("e7270", FaultPlan(seed=3, corruption=0.2, from_s=0.8)),
         ("e7270", FaultPlan(silent_after_s=0.8)),
         ("e7270", FaultPlan(disconnect_after_s=0.9)),
-        ("e7270", FaultPlan(full_after_s=0.7, full_for_s=0.2)),
-        ("e7270", FaultPlan(full_after_s=0.7)),
     ],
 )
 def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
