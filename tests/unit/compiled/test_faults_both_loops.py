@@ -5,18 +5,17 @@ Whole runs in virtual time over socket pairs, judged from the devices' truth. Al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from tools.research.faults.campaign import FaultRow, run_campaign
 from tools.research.faults.catalogue import faults
 from tools.research.faults.phases import HOLD, LEARNING, RAMP, STEADY, Phase
-from tools.research.faults.points import POINTS
+from tools.research.faults.points import POINTS, write_bench
+from tools.research.faults.trial import observe_running
 
 BENCHES = Path(__file__).parents[3] / "benches"
-SERIAL = (
+NAMES = (
     "serial: silence",
     "serial: one byte in a thousand lost",
     "serial: bytes doubled",
@@ -28,51 +27,38 @@ SERIAL = (
     "magnetometer: ADC never ready",
     "can: stop button pressed",
 )
-CAN = (
-    "can: bus silent",
-    "can: one frame in five lost",
-    "can: bits of frames flipped",
-    "can: frames out of order",
-    "can: controller bus-off",
+OF_THE_DAC = (
+    "output bus: DAC refuses its address",
+    "output bus: DAC refuses data",
+    "output bus: SDA stuck",
+    "output bus: DAC restarts",
+    "output bus: one transfer in a hundred refused",
+    "output bus: a bit wrong in one transfer of ten",
+    "output bus: silence",
+    "output bus: adapter unplugged",
+    "actuator: open",
     "host: stalls for 50 ms",
+    "host: stalls for 500 ms",
+    "host: guardian killed (kill -9)",
 )
-OF_THE_OUTPUT = ("output bus: ", "actuator: ", "host: stalls", "host: guardian", "host: firmware")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = pytest.mark.slow
 
 
-def campaigns(bench: str, names: Sequence[str], phases: Sequence[Phase]) -> tuple[list[FaultRow], list[FaultRow]]:
-    """Return the rows of the faults whose names begin with one of ``names``, by the Python loop and compiled."""
-    chosen = [fault for fault in faults() if fault.name.startswith(tuple(names))]
-    assert len(chosen) >= len(names)
-    python, compiled = (
-        run_campaign(
-            BENCHES / f"{bench}.toml", chosen, points=POINTS[1:2], phases=phases, seeds=(5,), jobs=1,
-            progress=lambda text: None, compiled=c,
-        )
-        for c in (False, True)
-    )  # fmt: skip
-    return python, compiled
+def compare(folder: Path, bench: str, names: tuple[str, ...], phase: Phase) -> None:
+    file = write_bench(BENCHES / f"{bench}.toml", POINTS[1], folder)
+    chosen = [fault for fault in faults() if fault.name in names]
+    assert len(chosen) == len(names)
+    python, compiled = (observe_running(file, "typical", chosen, 5, phase, compiled=c) for c in (False, True))
+    assert compiled == python
 
 
-def differences(python: list[FaultRow], compiled: list[FaultRow]) -> list[str]:
-    assert len(python) == len(compiled) > 0
-    pairs = [
-        (a, b)
-        for p, c in zip(python, compiled, strict=True)
-        for a, b in zip(p.observations, c.observations, strict=True)
-    ]
-    return [f"{a}\nbut compiled\n{b}" for a, b in pairs if a != b]
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("phase", [LEARNING, STEADY, HOLD, RAMP], ids=lambda phase: phase.name)
+def test_answers_are_those_of_the_python_loop(tmp_path: Path, phase: Phase):
+    compare(tmp_path, "micron-e727", NAMES, phase)
 
 
-def test_the_serial_bench():
-    assert not differences(*campaigns("micron-e727", SERIAL, (LEARNING, STEADY, HOLD, RAMP)))
-
-
-def test_every_fault_of_the_output_of_the_default_bench():
-    python, compiled = campaigns("micron", OF_THE_OUTPUT, (STEADY, HOLD))
-    assert not differences(python, compiled)
-    assert all(row.as_dict()["as_expected"] == row.as_dict()["runs"] for row in compiled)
-
-
-def test_the_bench_with_the_can_node():
-    assert not differences(*campaigns("micron-can", CAN, (STEADY, HOLD)))
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("phase", [STEADY, HOLD], ids=lambda phase: phase.name)
+def test_answers_of_the_bench_with_a_guardian_are_those_of_the_python_loop(tmp_path: Path, phase: Phase):
+    compare(tmp_path, "micron", OF_THE_DAC, phase)
