@@ -93,7 +93,7 @@ class Run(NamedTuple):
         compiled, ticks = self.outcome.get("loop", {}).get("ticks", 0), self.outcome["ticks"]["run"]
         held, safe = len(self.outcome["holds"]), self.outcome["safe_state"]
         ended = "" if safe["normal"] else f"; ended early: {safe['reason']}"
-        return f"{self.outcome['commands']} commands, {compiled} of {ticks} ticks compiled, {held} holds{ended}"
+        return f"{self.outcome['commands']['sent']} commands, {compiled} of {ticks} ticks compiled, {held} holds{ended}"
 
 
 # -- the bare echo -----------------------------------------------------------------------------------------
