@@ -98,10 +98,11 @@ def is_link_well(out: OutputMemory, fd: int, now_ns: int) -> bool:
         return False
     if link.asked_ns[0] == NEVER:
         return True
-    polls = stack_index(1)  # pyright: ignore[reportCallIssue]
+    polls = stack_index(1)  # pyright: ignore[reportCallIssue, reportUnknownVariableType]
     polls[0] = poll_word(fd, POLLIN)
     n, verdict = 0, NOTHING
-    if wait_fds(polls, 0) != 0:  # a read of a tty that has nothing gives 0 bytes, as one that was hung up does
+    # a read of a tty that has nothing gives 0 bytes, as one that was hung up does
+    if wait_fds(polls, 0) != 0:  # pyright: ignore[reportUnknownArgumentType]
         n = read_fd(fd, out.answer, 0, len(out.answer))
         if n <= 0:
             return False
