@@ -207,8 +207,10 @@ class NumpyStep:
         a.running = 1
         sample = f[AT["tip_acceleration"]].copy()
         e.samples[:] = sample
-        e.turned[:] = np.cross(f[AT["angular_acceleration"]], p.arm)
-        a.pending[:] = np.stack([e.samples, e.turned], axis=1)[:, : q.onward.shape[1]]
+        e.turned[:] = p.lever @ f[AT["angular_acceleration"]]
+        w, x, y, z = f[AT["quaternion"]]
+        a.up[:] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+        a.pending[:] = np.column_stack([e.samples, e.turned])[:, : q.onward.shape[1]]
         a.bank[:] = self.turned(a.bank, a.pending)
         self.combine(sample)
         calm, burst = np.einsum("alom,am->loa", a.filter, a.bank)
@@ -249,7 +251,19 @@ class NumpyStep:
         a.bursts[:, at % (lag + 1)] = a.burst
         if at >= 2 * taps:
             self.regress(at, taps, lag)
+            self.know_noise()
             self.solve(at % 3, at // 3 % 2)
+
+    def know_noise(self) -> None:
+        """Set the noise's share in learning for the present attitude; ``adaptive.py`` has the same for its other band,
+        which these rows do not use."""
+        a, q = self.e.adaptive, self.ep.adaptive
+        linear = q.lean_by_up @ a.up  # (axis, channel)
+        square = np.zeros_like(linear)
+        square[:, 0] = np.einsum("k,ikn,n->i", a.up, q.lean_by_square, a.up)
+        a.noise_power[:] = q.noise_power + linear[:, 0] * q.lean_power[0] + square[:, 0] * q.lean_power[1]
+        more = np.einsum("ic,oj->iocj", linear, q.lean_cross[0]) + np.einsum("ic,oj->iocj", square, q.lean_cross[1])
+        a.noise_cross[:] = q.noise_cross + more.reshape(q.noise_cross.shape)
 
     def regress(self, at: int, taps: int, lag: int) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
@@ -268,7 +282,7 @@ class NumpyStep:
     def solve(self, axis: int, level: int) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
         count, n0 = a.count[axis, level], q.prior_blocks[level]
-        known = a.power[axis, level] + n0 * q.weighted_power[level] - q.noise_power[axis] * count
+        known = a.power[axis, level] + n0 * q.weighted_power[level] - a.noise_power[axis] * count
         power = max(known / (count + n0), q.least_power)
         counts = sum(q.share[axis, other] * a.count[other, level] for other in range(3))
         matrix = n0 * (power * q.tremor[level] + q.rest[axis]) + (n0 + counts) * q.quiet[axis]
@@ -279,7 +293,7 @@ class NumpyStep:
                 share = q.share[axis, other]
                 ratio = 1.0 if other == axis else min(1.0, power * rows / seen)
                 matrix = matrix + share * (ratio * a.normal[other, level] + (1.0 - ratio) * rows * q.rest[other])
-                right = right + share * ratio * (a.right[other, level] - rows * q.noise_cross[other])
+                right = right + share * ratio * (a.right[other, level] - rows * a.noise_cross[other])
         scale = 1.0 / np.sqrt(np.diag(matrix))
         lower = np.tril(matrix) * np.outer(scale, scale)
         whole = lower + np.tril(lower, -1).T + 1e-9 * np.eye(len(scale))

@@ -383,11 +383,28 @@ static void regress(Adaptive *s, int axis, int at, const Filter *p)
     }
 }
 
+static void know_noise(Adaptive *s, const Filter *p)
+{
+    int one = BANK / CHANNELS;
+    for (int i = 0; i < 3; i++)
+        for (int c = 0; c < CHANNELS; c++) {
+            double linear = 0.0, square = 0.0;
+            for (int k = 0; k < 3; k++) linear += p->lean_by_up[i][c][k] * s->up[k];
+            for (int k = 0; c == 0 && k < 3; k++)
+                for (int n = 0; n < 3; n++) square += s->up[k] * p->lean_by_square[i][k][n] * s->up[n];
+            if (c == 0) s->noise_power[i] = p->noise_power[i] + linear * p->lean_power[0] + square * p->lean_power[1];
+            for (int o = 0; o < OUTPUTS; o++)
+                for (int j = 0; j < one; j++)
+                    s->noise_cross[i][o][c * one + j] = p->noise_cross[i][o][c * one + j]
+                        + linear * p->lean_cross[0][o][j] + square * p->lean_cross[1][o][j];
+        }
+}
+
 static void solve(Adaptive *s, int axis, int l, const Filter *p)
 {
     double a[BANK][BANK], scale[BANK], count = s->count[axis][l], n0 = p->prior_blocks[l];
     double(*x)[sizeof(((Filter *)0)->onward[0][0]) / sizeof(double)] = s->solution;
-    double power = (s->power[axis][l] + n0 * p->weighted_power[l] - p->noise_power[axis] * count) / (count + n0);
+    double power = (s->power[axis][l] + n0 * p->weighted_power[l] - s->noise_power[axis] * count) / (count + n0);
     if (power < p->least_power) power = p->least_power;
     double all = n0;
     for (int other = 0; other < 3; other++) all += p->share[axis][other] * s->count[other][l];
@@ -403,7 +420,7 @@ static void solve(Adaptive *s, int axis, int l, const Filter *p)
         double factor = share * ratio, back = share * (1.0 - ratio) * rows;
         for (int i = 0; i < BANK; i++) {
             for (int j = 0; j <= i; j++) a[i][j] += factor * s->normal[other][l][i][j] + back * p->rest[other][i][j];
-            for (int o = 0; o < OUTPUTS; o++) x[o][i] += factor * (s->right[other][l][o][i] - rows * p->noise_cross[other][o][i]);
+            for (int o = 0; o < OUTPUTS; o++) x[o][i] += factor * (s->right[other][l][o][i] - rows * s->noise_cross[other][o][i]);
         }
     }
     for (int i = 0; i < BANK; i++) scale[i] = 1.0 / sqrt(a[i][i]);
@@ -462,6 +479,7 @@ static void learn(Adaptive *s, const Filter *p)
         s->bursts[i][at % (LAG + 1)] = s->burst[i];
         if (at >= 2 * TAPS_) regress(s, i, at, p);
     }
+    if (at >= 2 * TAPS_) know_noise(s, p);
     if (at >= 2 * TAPS_) solve(s, at % 3, at / 3 % LEVELS, p);
 }
 
@@ -513,11 +531,15 @@ static int estimate(double *f, estimate_state *s, const estimate_params *p)
         for (int n = 0; n < 3 * LEVELS * OUTPUTS * BANK; n++) used[n] += q->ease * (solved[n] - used[n]);
     }
     a->running = 1;
+    double w = f[QUATERNION], x = f[QUATERNION + 1], y = f[QUATERNION + 2], z = f[QUATERNION + 3];
+    a->up[0] = 2.0 * (x * z - w * y), a->up[1] = 2.0 * (y * z + w * x), a->up[2] = 1.0 - 2.0 * (x * x + y * y);
     for (int i = 0; i < 3; i++) {
-        int k = (i + 1) % 3, l = (i + 2) % 3;
         double sample = f[TIP_ACCELERATION + i], predicted[CHANNELS];
         s->samples[i] = sample;
-        s->turned[i] = f[ANGULAR_ACCELERATION + k] * p->arm[l] - f[ANGULAR_ACCELERATION + l] * p->arm[k];
+        for (int c = 0; c < CHANNELS - 1; c++) {
+            s->turned[i][c] = 0.0;
+            for (int j = 0; j < 3; j++) s->turned[i][c] += p->lever[i][c][j] * f[ANGULAR_ACCELERATION + j];
+        }
         for (int c = 0; c < CHANNELS; c++) {
             predicted[c] = 0.0;
             for (int j = 0; j < BANK; j++) predicted[c] += q->onward[i][c][j] * a->bank[i][j];
@@ -526,7 +548,7 @@ static int estimate(double *f, estimate_state *s, const estimate_params *p)
         for (int c = 0; c < CHANNELS; c++) bank_add(a->bank[i], c, predicted[c], q);
         combine(sample, &s->combiner[i], &p->combiner);
         for (int c = 0; c < CHANNELS; c++) {
-            a->pending[i][c] = c ? s->turned[i] : sample;
+            a->pending[i][c] = c ? s->turned[i][c - 1] : sample;
             bank_add(a->bank[i], c, a->pending[i][c] - predicted[c], q);
         }
     }

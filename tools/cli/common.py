@@ -37,6 +37,7 @@ DECIDING = (
     ("mismatch", "watch"),
     ("mismatch", "plan"),
     ("run",),
+    ("bench",),
 )
 """The commands that take ``--trust`` and ``--allow-outside``."""
 

@@ -77,7 +77,7 @@ def test_a_change_is_an_alert_with_a_place(tmp_path: Path):
 
 def test_the_last_minute_is_a_recording_of_the_same_twin(tmp_path: Path):
     beside, rows = watch(tmp_path), frames(70.0)
-    history = History(LAYOUT.size, TIME)
+    history = History(LAYOUT)
     history.append(rows)
     push(beside, rows[:1000])
     folder = beside.write_last_minute(history, tmp_path / "last")
@@ -95,7 +95,7 @@ def test_without_a_twin_nothing_is_watched_and_the_button_says_so(tmp_path: Path
     assert nothing.state() is None
     assert nothing.alerts() == []
     with pytest.raises(InputError, match="--watch"):
-        nothing.write_last_minute(History(LAYOUT.size, TIME), tmp_path / "last")
+        nothing.write_last_minute(History(LAYOUT), tmp_path / "last")
 
 
 def test_a_twin_that_does_not_fit_another_bench_is_told_on_the_page(tmp_path: Path):
