@@ -30,7 +30,7 @@ STATE, COUNTER, ACKNOWLEDGED, STATUS_NS, SAFE_STEPS, ASKED_NS, WORDS = range(7)
 """Places in ``NodeMemory.words``: the node's state, the counter of the next set point, the last one that a STATUS has
 acknowledged, when that came, steps since the safe state was asked for, and when that was."""
 WELL, SILENT, LEFT, LAGS = range(4)
-"""What ``link_fault`` finds: nothing, no STATUS, a node that is not armed, set points that are not accepted."""
+"""The answers of ``link_fault``: nothing, no STATUS, a node that is not armed, set points that are not accepted."""
 
 
 def _crc_table() -> bytes:

@@ -148,6 +148,6 @@ def stack(
 
 
 def named(made: Recording, names: Iterable[str]) -> set[str]:
-    """What is named of a recording where these are the effects that are known."""
+    """Return the names that a diagnosis gives where these are the effects that are known."""
     report = diagnose(made, effects=[EFFECTS[n] for n in names], jobs=1)
     return {p.name for p in report.physics}

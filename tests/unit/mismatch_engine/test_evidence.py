@@ -41,7 +41,7 @@ def stage(seed: int, *, coulomb: float = 0.0, late_samples: float = 0.0) -> Reco
 
 
 def weighed(made: Recording, name: str) -> tuple[frozenset[str], tuple[Withheld, ...], Store]:
-    """What is named and what is withheld where a search took one effect; and the sets of that search."""
+    """Return the names, the withheld effects and the sets of a search that took one effect."""
     problem, _, base = prepared(made, 0.3, 0, False)
     store = Store(problem, base, learned())
     with np.errstate(all="ignore"):

@@ -10,6 +10,7 @@ import pytest
 from firmware_py.frame import LAYOUT, TIME
 from hal.bench import load_bench
 from tests.conftest import DEFAULT_BENCH
+from tests.unit.mismatch_watch.test_live import STACK_TWIN
 from tools.bench.firmware import Choice
 from tools.bench.history import History
 from tools.bench.twin_watch import TwinWatch
@@ -17,23 +18,6 @@ from tools.errors import InputError
 from tools.mismatch.recording_load import load
 from tools.mismatch.watch.live import Settings
 
-TWIN = """format = 1
-[twin]
-kind = "piezo_stack"
-[twin.parameters]
-gain_um_per_V = 0.125
-offset_um = 0.0
-[[channels]]
-column = "command_1"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "stroke_1"
-role = "output"
-signal = "displacement"
-unit = "m"
-"""
 STATUS = {"now_ns": 500_000_000, "t_s": 0.0}
 
 
@@ -47,7 +31,7 @@ def frames(seconds: float) -> np.ndarray:
     return rows
 
 
-def watch(tmp_path: Path, text: str = TWIN) -> TwinWatch:
+def watch(tmp_path: Path, text: str = STACK_TWIN) -> TwinWatch:
     (tmp_path / "twin.toml").write_text(text)
     beside = TwinWatch(Settings(tmp_path / "twin.toml", 15.0, 0.01))
     beside.begin(load_bench(DEFAULT_BENCH), Choice(DEFAULT_BENCH))
@@ -99,7 +83,7 @@ def test_without_a_twin_nothing_is_watched_and_the_button_says_so(tmp_path: Path
 
 
 def test_a_twin_that_does_not_fit_another_bench_is_told_on_the_page(tmp_path: Path):
-    beside = watch(tmp_path, TWIN.replace("stroke_1", "stroke_7"))
+    beside = watch(tmp_path, STACK_TWIN.replace("stroke_1", "stroke_7"))
     ((kind, text),) = beside.alerts()
     assert kind == "warn"
     assert "no column 'stroke_7'" in text

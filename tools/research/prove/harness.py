@@ -18,7 +18,7 @@ from tools.research.prove.runner import Diagnose, in_processes, timed, tool
 
 SHARED = ("tools/mismatch/engine", "tools/mismatch/twins", "sim_devices/physics")
 SOURCES = (*SHARED, "tools/mismatch/infer")
-"""What a diagnosis depends on: a row that was made with other sources is made again."""
+"""The sources that a diagnosis depends on. A row that was made with other sources is made again."""
 
 
 @dataclass(frozen=True)
