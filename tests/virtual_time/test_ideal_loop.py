@@ -22,12 +22,5 @@ def test_the_ideal_loop_cancels_most_of_the_tremor(row: IdealRow) -> None:
 
 
 @pytest.mark.slow
-def test_the_ratio_to_the_bound_is_the_one_that_was_reported(row: IdealRow) -> None:
-    """The goal is missed; a run in virtual time is the same everywhere, so a change of what it leaves is seen here."""
-    assert row.ratio == pytest.approx(1.288, abs=0.02)
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(reason="1.29 times the bound with the bench's settings against tremor above the band")
 def test_the_ideal_loop_is_near_the_bound(row: IdealRow) -> None:
     assert row.ratio < GOAL
