@@ -16,8 +16,8 @@ FILE = Path(__file__).with_name("constants.json")
 class Constants:
     """Holds the constants of a decision.
 
-    ``samples``: independent samples that a held-out residual counts for at most (form errors are systematic);
-    ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
+    ``samples``: independent samples that a held-out residual of noise counts for at most, and ``form_samples`` one
+    of form errors (``Count``); ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
     ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left and follow signals before the
     account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones, less
     ``sure_open`` where the account is none; ``most_sure``: the probability that is stated at most, by how many cases
@@ -25,6 +25,7 @@ class Constants:
     """
 
     samples: float
+    form_samples: float
     per_name: float
     per_parameter: float
     least_z: float
@@ -44,7 +45,7 @@ class Constants:
         return {k: float(f"{v:.6g}") for k, v in asdict(self).items()}
 
 
-START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 0.0, 1.0)
+START = Constants(300.0, 60.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 0.0, 1.0)
 """Start values of the learning, also used in the searches of its training fits: the middle of the ranges that a
 prototype found on cases of another generator."""
 

@@ -17,7 +17,7 @@ from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
 from tools.mismatch.infer.borne_out import borne_out, entry_of
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import unpredicted, weigh
+from tools.mismatch.infer.density import unpredicted
 from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
@@ -171,9 +171,8 @@ def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger
 def curve_score(store: Store, s: Scored, found: Stranger) -> float:
     """Return the score of ``s`` with a free curve beside it: its gain on held-out blocks, less its price."""
     c = store.constants
-    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * store.counted / store.outputs
-    room = store.room(s)[found.output]
-    return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
+    gain = store.count.curve_gain(store.short(s)[found.output], found.share) / store.outputs
+    return store.score(s) + gain - c.per_name - c.per_parameter * CURVE
 
 
 @dataclass(frozen=True)
@@ -274,9 +273,8 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
 
 def recalibrated(store: Store, raw: Fit) -> bool:
     """Return True if re-fitted base parameters predict better than the given ones by more than their price."""
-    p, c = store.problem, store.constants
-    before = float(np.mean([np.mean(w.density[p.held_rows]) for w in weigh(p, raw).values()]))
-    gain = store.counted * (float(np.mean([*store.base.density.values()])) - before)
+    c = store.constants
+    gain = store.lost(store.scored(raw)) - store.lost(store.base)
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 
 

@@ -119,7 +119,7 @@ def least_named(store: Store) -> LeastNamed:
     They are the test of the effect, and the noise variances that pay its price and exceed the form error of others.
     """
     c = store.constants
-    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / store.counted)
+    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / store.count.noise)
     least = max(pays, c.cut)
     return LeastNamed(c.least_z, least / (1.0 + least))
 

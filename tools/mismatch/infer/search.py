@@ -65,7 +65,7 @@ class Search:
         self.stride = max(1, problem.fit_rows.size // 12000)
         c = constants
         # by half of the price of its name
-        least = 1.0 - float(np.exp(-c.per_name / max(self.store.counted, 1.0)))
+        least = 1.0 - float(np.exp(-c.per_name / max(self.store.count.noise, 1.0)))
         self.effort = Effort(WORTH_REFINING, least)
         self.first: tuple[Trial, ...] = ()
 
@@ -134,7 +134,7 @@ class Search:
 
     def gain_before_prices(self, s: Scored) -> float:
         """Return the nats that a set gains over the base before the prices of its names and parameters."""
-        return self.store.counted * (s.mean_density - self.store.base.mean_density)
+        return self.store.lost(self.store.base) - self.store.lost(s)
 
     def swap(self, best: Scored) -> None:
         """Replace every name of ``best`` by those that do about as well alone on the same outputs.

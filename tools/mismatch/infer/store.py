@@ -17,6 +17,7 @@ from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.engine.vary import added, beyond_limits, size
 from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.density import (
     LEAST,
     best_log_density,
@@ -50,8 +51,7 @@ class Scored:
 
     ``density`` is the mean log density of held-out samples per output, ``blocks`` (blocks, outputs) the same per
     held-out block; ``parameters`` is the number of parameters of the effects. ``proper`` is True if the fit did not
-    diverge and every effect is within its physical range. ``outputs`` is the number of outputs in the mean
-    (``Store.outputs``).
+    diverge and every effect is within its physical range.
     """
 
     key: Key
@@ -60,29 +60,14 @@ class Scored:
     blocks: Array = field(repr=False)
     parameters: float
     proper: bool
-    outputs: float = 1.0
 
     @property
     def names(self) -> frozenset[str]:
         return frozenset(p.effect.name for p in self.fitted.model.placed)
 
     @property
-    def mean_density(self) -> float:
-        """Return the nats per held-out sample, averaged over the outputs that have something to explain."""
-        return sum(self.density.values()) / self.outputs
-
-    @property
     def placed(self) -> tuple[Placed, ...]:
         return self.fitted.model.placed
-
-    def score(self, c: Constants, counted: float) -> float:
-        """Return the score in nats: the tempered log density less the prices of names and parameters.
-
-        The likelihood is raised to a power below one, because the form of a model is never exact (Miller and Dunson
-        2019). ``counted`` is the number of samples that a residual counts for. The density is the mean over the outputs
-        that have something to explain, because an error of form on one of them is repeated on all.
-        """
-        return counted * self.mean_density - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
 class Store:
@@ -96,9 +81,7 @@ class Store:
         self.problem = problem
         self.events = tuple(events)
         self.constants = constants
-        held = int(problem.held_rows.size)
-        self.counted = min(constants.samples * recordings_held(problem), float(held))
-        """Number of samples that a held-out residual counts for; form errors are systematic within a recording."""
+        self.count = Count.of(constants, int(problem.held_rows.size), recordings_held(problem))
         self.sets: dict[Key, Scored] = {}
         self.seen: dict[Part, Candidate] = {}
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
@@ -106,7 +89,7 @@ class Store:
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
         self.outputs = float(len(problem.twin.outputs))
-        self.outputs = outputs_at_odds([*self.room(self.scored(base)).values()])
+        self.outputs = outputs_at_odds([max(v, 0.0) for v in self.short(self.scored(base)).values()])
         self.base = self.put(base)
 
     def listen(self, s: Scored) -> None:
@@ -141,19 +124,35 @@ class Store:
         proper = proper and all(self.lawful(w.predictable) for w in every.values())
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
-        free = self.counted / self.outputs * sum(w.free for w in every.values())
+        free = self.count.noise / self.outputs * sum(w.free for w in every.values())
         figures = free + sum(figures_of(e) for e in fitted.model.placed)
-        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper, self.outputs)
+        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
 
     def lawful(self, predictable: float) -> bool:
         """Return True if the prediction errors of a noise effect are white enough.
 
         Their predictable part, in nats per sample, must cost no more than another name.
         """
-        return self.counted * predictable < self.constants.per_name
+        return self.count.noise * predictable < self.constants.per_name
 
     def score(self, s: Scored) -> float:
-        return s.score(self.constants, self.counted) if s.proper else -np.inf
+        """Return the score in nats: the tempered log density less the prices of names and parameters.
+
+        The likelihood is raised to a power below one, because the form of a model is never exact (Miller and Dunson
+        2019), and to a smaller one where form errors are most of the residual (``Count``). The loss is the mean over
+        the outputs that have something to explain, because an error of form on one of them is repeated on all.
+        """
+        c = self.constants
+        prices = c.per_name * len(s.names) + c.per_parameter * s.parameters
+        return -self.lost(s) - prices if s.proper else -np.inf
+
+    def lost(self, s: Scored) -> float:
+        """Return the nats by which a set predicts worse than noise at its floor would be predicted."""
+        return sum(self.count.lost(v) for v in self.short(s).values()) / self.outputs
+
+    def short(self, s: Scored) -> dict[str, float]:
+        """Return the nats per held-out sample and output by which the density of a set is below that of noise."""
+        return {o: self._best[o] - d for o, d in s.density.items()}
 
     def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
         """Return the proper sets, the best of each set of names, best first."""
@@ -168,12 +167,12 @@ class Store:
 
         The bound is noise at its floor or, if a set has found readings on a lattice, the prediction of all of them.
         """
-        n = self.counted / self.outputs
-        best = {
-            o: b if d < b else max(b, self._exact[o])
-            for (o, d), b in zip(s.density.items(), self._best.values(), strict=True)
-        }
-        return {o: max(n * (best[o] - d), 0.0) for o, d in s.density.items()}
+        out: dict[str, float] = {}
+        for o, short in self.short(s).items():
+            # a set that is better than noise has found the lattice
+            least = 0.0 if short > 0.0 else min(0.0, self._best[o] - self._exact[o])
+            out[o] = max(self.count.lost(short) - self.count.lost(least), 0.0) / self.outputs
+        return out
 
     def without(self, s: Scored, drop: Callable[[Placed], bool]) -> Scored:
         """Return the set without the effects that ``drop`` selects, fitted again unless the store has it."""

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from firmware_py.recording.revision import git_revision
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Effect
 from tools.mismatch.infer.constants import FILE, START, Constants
 from tools.mismatch.infer.decide import stated
 from tools.mismatch.infer.run import infer
 from tools.mismatch.recording_load import load
 from tools.output import write_text_atomic
+from tools.research.prove.catalog import RIVALS
 from tools.research.prove.corpus import CORPORA, answers_digest, digest_of, draw_case, generator_digest
 from tools.research.prove.exact import reliability
 from tools.research.prove.guests import installed
@@ -21,7 +24,7 @@ from tools.research.prove.harness import SHARED
 from tools.research.prove.learn import Case, StatedName, cross_validated, learn, learn_sure, traits_of
 from tools.research.prove.plans import SELDOM
 
-SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("density", "search", "store")))
+SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("count", "density", "search", "store")))
 """What the traits of a search depend on."""
 LEAST_CASES = 15
 """Cases with fewer of which no constants are learned."""
@@ -60,6 +63,10 @@ def gather(
             if drawn is not None and drawn.answer["twin"] not in SELDOM:
                 with installed(drawn.recording):
                     row["traits"] = traits_of(infer(load(drawn.recording), START))
+                    row["without"] = {
+                        name: traits_of(infer(load(drawn.recording), START, effects=vocabulary_without(name)))
+                        for name in beside(drawn.answer)
+                    }
                 row["answer"] = drawn.answer
             row["cpu_s"] = round(time.process_time() - began, 2)
             rows.write(json.dumps(row, default=float) + "\n")
@@ -67,6 +74,26 @@ def gather(
             done[number] = row
             progress(f"{len(done)} kept  case {number}  {row['cpu_s']:.1f} s of CPU")
     return {n: done[n] for n in numbers if n in done}, sum(n not in done for n in numbers)
+
+
+def names_of(answer: Mapping[str, Any]) -> list[str]:
+    """Return the names of the effects of a case that have one."""
+    return [e["name"] for e in answer["effects"] if e["name"] != "unknown"]
+
+
+def beside(answer: Mapping[str, Any]) -> list[str]:
+    """Return the names of a pair: without one of them in the vocabulary, the right answer is the other one alone.
+
+    Real recordings are like this: a named effect stands beside physics that no name is for.
+    """
+    names = names_of(answer)
+    return names if len(names) == 2 else []
+
+
+def vocabulary_without(name: str) -> list[Effect]:
+    """Return the vocabulary without an effect and those that it is easily taken for."""
+    gone = {name}.union(*(group for group in RIVALS if name in group))
+    return [e for e in EFFECTS.values() if e.name not in gone]
 
 
 def calibrate(
@@ -87,7 +114,7 @@ def calibrate(
     kept = {n: r for n, r in rows.items() if "traits" in r}
     if (left and not partial) or len(kept) < LEAST_CASES:
         return None, left
-    known = [case_of(n, r) for n, r in kept.items()]
+    known = [case for n, r in kept.items() for case in cases_of(n, r)]
     crossed = cross_validated(known)
     constants = learn_sure(learn(known), [n for of in crossed.stated for n in of])
     corpus = CORPORA["calibrate"]
@@ -103,6 +130,7 @@ def calibrate(
             "seeds": [corpus.first, corpus.seed_of(cases - 1)],
             "numbers": list(kept),
             "cases": len(kept),
+            "with_a_name_left_out": len(known) - len(kept),
             "without": sorted(SELDOM),
             "max_samples": samples,
             "corpus_sha256": answers_digest([r["answer"] for r in kept.values()]),
@@ -126,10 +154,13 @@ def _left_out(constants: Constants, names: Sequence[Sequence[StatedName]], k: in
     return [(stated(n.sure, n.whole, others), float(n.right)) for n in names[k]]
 
 
-def case_of(number: int, row: dict[str, Any]) -> Case:
-    """A row of traits with its answer."""
-    names = [e["name"] for e in row["answer"]["effects"] if e["name"] != "unknown"]
-    return Case.of(f"c{number:05d}", row["answer"]["kind"], names, row["traits"])
+def cases_of(number: int, row: dict[str, Any]) -> list[Case]:
+    """Return the case of a row of traits with its answer, and those with a name of a pair left out."""
+    case, kind, names = f"c{number:05d}", row["answer"]["kind"], names_of(row["answer"])
+    out = [Case.of(case, kind, names, row["traits"])]
+    for left_out, traits in row["without"].items():
+        out.append(Case.of(f"{case} without {left_out}", "beside", [n for n in names if n != left_out], traits))
+    return out
 
 
 def write_constants(body: dict[str, Any], file: Path = FILE) -> Path:

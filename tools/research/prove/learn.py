@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from tools.mismatch.infer.constants import START, Constants
+from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.decide import (
     CURVE,
     candidate_signals,
@@ -28,7 +29,7 @@ from tools.mismatch.infer.decide import (
     worst_left,
 )
 from tools.mismatch.infer.run import Inferred
-from tools.mismatch.infer.store import Scored, Store, z_of_p
+from tools.mismatch.infer.store import z_of_p
 
 Traits = Mapping[str, Any]
 
@@ -49,13 +50,13 @@ SETS = 60
 class SetTraits:
     """Holds the figures of a set of names that a decision uses.
 
-    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and
+    ``short`` is that of ``Store.short`` per output; ``z`` is that of the weakest name (None: not tested); ``rest`` and
     ``explained`` are those of ``worst_left`` (None: not computed); ``events`` has the p-values of events found beside
     the set.
     """
 
     names: frozenset[str]
-    density: float
+    short: tuple[float, ...]
     parameters: float
     z: float | None
     rest: float | None
@@ -66,9 +67,11 @@ class SetTraits:
         """Return the names that a report of this set has."""
         return self.names | {n for n, p in self.events.items() if z_of_p(p) > c.least_z}
 
-    def score(self, c: Constants, held: int) -> float:
-        """Return the score as ``Scored.score`` does."""
-        return min(c.samples, held) * self.density - c.per_name * len(self.names) - c.per_parameter * self.parameters
+    def score(self, c: Constants, held: int, outputs: float) -> float:
+        """Return the score as ``Store.score`` does."""
+        count = Count.of(c, held)
+        lost = sum(count.lost(v) for v in self.short) / outputs
+        return -lost - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
 def traits_of(inferred: Inferred) -> dict[str, Any]:
@@ -87,22 +90,17 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
     kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
     return {
         "held": int(store.problem.held_rows.size),
-        "outputs": len(store.problem.twin.outputs),
+        "outputs": store.outputs,
         "sets": [
-            {"names": sorted(s.names), "density": s.mean_density, "parameters": s.parameters,
+            {"names": sorted(s.names), "short": [*store.short(s).values()], "parameters": s.parameters,
              "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
             for s in [*kept, *([] if store.base in kept else [store.base])]
         ],
         "strange": None if strange is None else {
-            "gain": -0.5 * math.log(max(1.0 - strange.share, 1e-12)) / store.outputs,
-            "room": _density_room(store, store.base, strange.output),
+            "share": strange.share,
+            "short": store.short(store.base)[strange.output],
         },
     }  # fmt: skip
-
-
-def _density_room(store: Store, s: Scored, output: str) -> float:
-    """Nats per sample by which an output can be predicted better at most."""
-    return store.room(s)[output] / store.counted
 
 
 def sets_of(traits: Traits) -> list[SetTraits]:
@@ -123,7 +121,7 @@ def sets_of(traits: Traits) -> list[SetTraits]:
         rest, explained = left.get(names, (None, None))
         beside = events.get(names, {})
         out.append(
-            SetTraits(names, float(s["density"]), float(s["parameters"]), passed.get(names), rest, explained, beside)
+            SetTraits(names, tuple(s["short"]), float(s["parameters"]), passed.get(names), rest, explained, beside)
         )
     return out
 
@@ -137,22 +135,28 @@ class Case:
     names: frozenset[str]
     held: int
     sets: tuple[SetTraits, ...]
-    curve: float | None
-    """Nats per sample that the best free curve of a signal gains about which no effect is."""
+    curve: tuple[float, float] | None
+    """(Share of the residual of the twin that the best free curve of a signal removes about which no effect is, nats
+    per sample that the twin is short of noise there)."""
+    outputs: float = 1.0
 
     @staticmethod
     def of(case: str, kind: str, names: Sequence[str], traits: Traits) -> Case:
         strange = traits["strange"]
-        curve = None if strange is None else min(float(strange["gain"]), float(strange["room"]))
-        return Case(case, kind, frozenset(names), int(traits["held"]), tuple(sets_of(traits)), curve)
+        curve = None if strange is None else (float(strange["share"]), float(strange["short"]))
+        sets = tuple(sets_of(traits))
+        return Case(case, kind, frozenset(names), int(traits["held"]), sets, curve, float(traits["outputs"]))
+
+    def score(self, s: SetTraits, c: Constants) -> float:
+        return s.score(c, self.held, self.outputs)
 
     def ranked(self, c: Constants) -> list[SetTraits]:
         """The best set of each set of names, best first."""
         best: dict[frozenset[str], SetTraits] = {}
         for s in self.sets:
-            if s.names not in best or s.score(c, self.held) > best[s.names].score(c, self.held):
+            if s.names not in best or self.score(s, c) > self.score(best[s.names], c):
                 best[s.names] = s
-        return sorted(best.values(), key=lambda s: (-s.score(c, self.held), sorted(s.names)))
+        return sorted(best.values(), key=lambda s: (-self.score(s, c), sorted(s.names)))
 
     def accepted(self, c: Constants) -> list[SetTraits]:
         """Sets whose every name passes its test, best first, down to the empty one; as ``decide.accepted``."""
@@ -169,8 +173,9 @@ class Case:
         chosen = self.accepted(c)[0]
         empty = next(s for s in self.ranked(c) if not s.names)
         if self.curve is not None:
-            gain = min(c.samples, self.held) * self.curve
-            if empty.score(c, self.held) + gain - c.per_name - c.per_parameter * CURVE > chosen.score(c, self.held):
+            share, short = self.curve
+            gain = Count.of(c, self.held).curve_gain(short, share) / self.outputs
+            if self.score(empty, c) + gain - c.per_name - c.per_parameter * CURVE > self.score(chosen, c):
                 return "unexplained", empty
         rest = chosen.rest if chosen.rest is not None else 0.0
         if not is_whole(rest, chosen.explained or 0.0, c):
@@ -182,12 +187,15 @@ class Case:
         verdict, chosen = self.says(c)
         if self.kind == "unknown":
             return verdict == "unexplained"
+        if self.kind == "beside":
+            # what is left of the other effect may be more than a form error or not
+            return verdict != "nothing" and chosen.with_events(c) == self.names
         return verdict == ("named" if self.names else "nothing") and chosen.with_events(c) == self.names
 
     def log_probability(self, c: Constants) -> float:
         """Log probability of the true set among those of the search, clipped."""
         ranked = self.ranked(c)
-        values = np.array([s.score(c, self.held) for s in ranked])
+        values = np.array([self.score(s, c) for s in ranked])
         own_scores = [
             v for s, v in zip(ranked, values, strict=True) if s.names | (self.names & s.events.keys()) == self.names
         ]
@@ -207,7 +215,7 @@ def learn(cases: Sequence[Case]) -> Constants:
         pull = 0.05 * float(np.sum((x - _start()) ** 2))
         return -float(np.mean([k.log_probability(c) for k in known])) + pull
 
-    found = minimize(loss, _start(), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 1e-4, "maxiter": 400})
+    found = minimize(loss, _start(), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 1e-4, "maxiter": 600})
     c = _weights(found.x)
     c = best_of(c, ({"least_z": z} for z in np.arange(2.0, 6.1, 0.25)), cases)
     cuts = ({"cut": a, "cut_share": b} for a in np.geomspace(0.1, 3.0, 10) for b in np.geomspace(0.01, 0.3, 9))
@@ -215,12 +223,12 @@ def learn(cases: Sequence[Case]) -> Constants:
 
 
 def _start() -> np.ndarray:
-    return np.log([START.samples, START.per_name, START.per_parameter])
+    return np.log([START.samples, START.form_samples, START.per_name, START.per_parameter])
 
 
 def _weights(x: np.ndarray) -> Constants:
-    n, name, parameter = (float(v) for v in np.exp(np.clip(x, -7.0, 9.0)))
-    return replace(START, samples=n, per_name=name, per_parameter=parameter)
+    n, form, name, parameter = (float(v) for v in np.exp(np.clip(x, -7.0, 9.0)))
+    return replace(START, samples=n, form_samples=min(form, n), per_name=name, per_parameter=parameter)
 
 
 def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequence[Case]) -> Constants:
@@ -271,7 +279,7 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
     for case in cases:
         verdict, chosen = case.says(c)
         whole = verdict != "unexplained"
-        sets = [(s.names, s.score(c, case.held)) for s in case.accepted(c)]
+        sets = [(s.names, case.score(s, c)) for s in case.accepted(c)]
         sure = surenesses(chosen.names, sets, whole, c)
         sure |= {n: stated(1.0 - chosen.events[n], whole, c) for n in chosen.with_events(c) - chosen.names}
         for name, p in sure.items():
