@@ -7,16 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import t as student
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer.constants import START, Constants, learned
+from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.decide import TESTED, accepted, is_whole, log_odds, stated, surenesses
 from tools.mismatch.infer.density import DEGREES, NORMAL, student_log_density, student_scale
 from tools.mismatch.infer.run import infer
-from tools.mismatch.infer.store import Scored
+from tools.mismatch.infer.store import Store
 from tools.mismatch.recording import Recording
 
 N = 2500
@@ -36,22 +38,55 @@ def test_what_normal_noise_scores_at_most() -> None:
     assert student_log_density(r, student_scale(r, 1e-9)).mean() == pytest.approx(NORMAL, abs=0.003)
 
 
+class _Store:
+    """The part of a store that a score reads; noise has zero nats per sample."""
+
+    score, lost, short = Store.score, Store.lost, Store.short
+
+    def __init__(self, count: Count, constants: Constants, outputs: int = 1) -> None:
+        self.count, self.constants, self.outputs = count, constants, float(outputs)
+        self._best = {"y": 0.0, **{f"idle{i}": 0.0 for i in range(outputs - 1)}}
+
+
 class _Set:
     """The part of a scored set that its score reads."""
 
-    score, mean_density = Scored.score, Scored.mean_density
-
     def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0) -> None:
         self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
-        self.names, self.parameters, self.outputs = frozenset(names), parameters, float(1 + idle)
+        self.names, self.parameters, self.proper = frozenset(names), parameters, True
 
 
 def test_a_name_and_a_parameter_have_their_price() -> None:
-    c = replace(START, samples=200.0, per_name=5.0, per_parameter=0.5)
-    assert _Set(0.1, {"a"}, 3).score(c, 200.0) == pytest.approx(200 * 0.1 - 5 - 1.5)
-    assert _Set(0.1, {"a", "b"}, 3).score(c, 200.0) == pytest.approx(200 * 0.1 - 10 - 1.5)
-    assert _Set(0.1, set(), 0).score(c, 50.0) == pytest.approx(5.0)
-    assert _Set(0.1, set(), 0, idle=3).score(c, 50.0) == pytest.approx(1.25)
+    c = replace(START, per_name=5.0, per_parameter=0.5)
+    store = _Store(Count(200.0, 50.0), c)
+    assert store.score(_Set(0.1, {"a"}, 3)) == pytest.approx(200 * 0.1 - 5 - 1.5)
+    assert store.score(_Set(0.1, {"a", "b"}, 3)) == pytest.approx(200 * 0.1 - 10 - 1.5)
+    assert store.score(_Set(-0.2, set(), 0)) == pytest.approx(-store.count.lost(0.2))
+    assert _Store(Count(200.0, 50.0), c, 4).score(_Set(-0.2, set(), 0, idle=3)) == pytest.approx(
+        -store.count.lost(0.2) / 4
+    )
+
+
+@pytest.mark.parametrize("count", [Count(218.0, 50.0), Count(300.0, 300.0), Count(900.0, 4.0)])
+def test_a_residual_counts_as_noise_near_the_noise_and_as_a_form_error_far_from_it(count: Count) -> None:
+    def freedom(short: float) -> float:
+        """Welch and Satterthwaite: the variances are exp(2 short) of the whole and 1 of the noise."""
+        whole = math.exp(2.0 * short)
+        return whole**2 / (1.0 / count.noise + (whole - 1.0) ** 2 / count.form)
+
+    for short in (0.003, 0.1, 1.0, 3.0):
+        assert count.lost(short) == pytest.approx(quad(freedom, 0.0, short, epsabs=1e-10)[0], rel=1e-8)
+    step = 1e-6
+    assert (count.lost(step) - count.lost(-step)) / (2.0 * step) == pytest.approx(count.noise, rel=1e-3)
+    assert count.lost(8.0) - count.lost(7.0) == pytest.approx(count.form, rel=1e-3)
+    assert math.isfinite(count.lost(math.inf))
+
+
+def test_a_curve_gains_no_more_than_the_noise_leaves() -> None:
+    count = Count(200.0, 50.0)
+    assert count.curve_gain(1.0, 0.5) == pytest.approx(count.lost(1.0) - count.lost(1.0 - 0.5 * math.log(2.0)))
+    assert count.curve_gain(0.1, 0.9) == pytest.approx(count.lost(0.1))
+    assert count.curve_gain(-0.1, 0.9) == 0.0
 
 
 def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:

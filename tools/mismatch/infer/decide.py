@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -72,16 +72,17 @@ class Answer:
 def tested(store: Store) -> list[tuple[Scored, float]]:
     """Return (set, the weakest test of its names), best first, down to the empty set.
 
-    If no set has passed, the search goes deeper, because an unsupported name may be in all of the first sets.
+    A test of a name fits the set without it; that smaller set is ranked with the others. If no set has passed, the
+    search goes deeper, because an unsupported name may be in all of the first sets.
     """
-    out: list[tuple[Scored, float]] = []
+    out: dict[frozenset[str], tuple[Scored, float]] = {}
     passed, c = 0, store.constants
-    for s in store.ranked()[:DEEPEST]:
-        out.append((s, store.least_z(s)))
-        passed += out[-1][1] > c.least_z
+    while len(out) < DEEPEST and (s := next((s for s in store.ranked() if s.names not in out), None)) is not None:
+        out[s.names] = s, store.least_z(s)
+        passed += out[s.names][1] > c.least_z
         if not s.names or (len(out) >= TESTED and passed):
             break
-    return out
+    return [out[s.names] for s in store.ranked() if s.names in out]
 
 
 def accepted(store: Store) -> list[Scored]:
@@ -99,14 +100,33 @@ def surenesses(
     It is the tempered posterior of the sets that have the name, mapped on a log odds scale that was calibrated on
     separate cases. ``whole``: nothing more is left.
     """
+    weights = posterior(sets)
+    return {name: stated(sum(w for of, w in weights if name in of), whole, c) for name in names}
+
+
+def posterior(sets: Sequence[tuple[frozenset[str], float]]) -> list[tuple[frozenset[str], float]]:
+    """Return the share of the tempered posterior of each of ``sets`` (names, score)."""
     top = max(v for _, v in sets)
     weights = [(of, math.exp(v - top)) for of, v in sets]
     total = sum(w for _, w in weights)
-    out: dict[str, float] = {}
-    for name in names:
-        p = sum(w for of, w in weights if name in of) / total
-        out[name] = stated(p, whole, c)
-    return out
+    return [(of, w / total) for of, w in weights]
+
+
+def dispensable(
+    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
+) -> set[str]:
+    """Return those of ``names`` that are as likely as not to be one too many.
+
+    A name has the support of the sets that have it, or another in its place: which of two equals it is, is a question
+    of its own (``Answer.rivals``).
+    """
+    weights = posterior(sets)
+
+    def support(name: str) -> float:
+        rest = names - {name}
+        return sum(w for of, w in weights if name in of or (len(of - rest) == 1 and len(rest - of) == 0))
+
+    return {name for name in names if stated(support(name), whole, c) < LIKELY}
 
 
 FLOOR = 1e-6
@@ -234,41 +254,71 @@ def _with_leads(problem: Problem, rest: Rest) -> dict[str, Leftover]:
     return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in rest.left.items()}
 
 
-UNLIKELY = 0.5
-"""Least probability of a name beside an unexplained rest, as a share of the largest that can be stated there."""
+LIKELY = 0.5
+"""Least stated probability that a name is not one too many."""
 
 
 def decide(store: Store, first: Sequence[Trial]) -> Answer:
     """Decide on a finished search. ``first``: the candidates that were screened beside the base."""
-    p, c = store.problem, store.constants
     good, withheld = borne_out(store, accepted(store))
     chosen = good[0]
-    strange = free_curve(p, store.base.fitted, candidate_signals(first))
+    strange = free_curve(store.problem, store.base.fitted, candidate_signals(first))
     if strange is not None and curve_score(store, store.base, strange) > store.score(chosen):
         chosen, withheld = store.base, ()
     else:
         strange = None
-    final = store.with_events(chosen)
-    rest = rest_of(p, final.fitted)
+    judged = judge(store, chosen, strange)
+    sets = [(s.names, store.score(s)) for s in good]
+    c, events = store.constants, store.eventful[chosen.key][1]
+    unlikely = dispensable(chosen.names, sets, judged.known, c)
+    unlikely |= {name for name, p in events.items() if stated(1.0 - p, judged.known, c) < LIKELY}
+    if unlikely:
+        final = judged.final
+        withheld += tuple(entry_of(store, final, k) for k, e in enumerate(final.placed) if e.effect.name in unlikely)
+        chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
+        fewer = judge(store, chosen, strange, events.keys() - unlikely)
+        # fewer names are no better account
+        judged = replace(fewer, whole=judged.whole and fewer.whole, known=judged.known and fewer.known)
+    sure = surenesses(chosen.names, sets, judged.known, c)
+    sure |= {name: stated(1.0 - p, judged.known, c) for name, p in events.items() if name not in unlikely}
+    left = judged.rest.left
     if strange is not None:
-        left = {o: v.led_by(strange) if o == strange.output else v for o, v in rest.left.items()}
+        left = {o: v.led_by(strange) if o == strange.output else v for o, v in left.items()}
     else:
-        left = _with_leads(p, rest)
+        left = _with_leads(store.problem, judged.rest)
+    return Answer(
+        judged.final, sure, rivals_of(store, chosen), strange, left, judged.rest.floors, judged.whole, judged.doubtful,
+        withheld,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Holds ``final``, a set with the events beside it, its ``rest``, and if that is an account (``whole``).
+
+    ``doubtful`` lists the outputs whose noise decides this; ``known`` is True if it is an account however loud the
+    noise is.
+    """
+
+    final: Scored
+    rest: Rest
+    whole: bool
+    doubtful: tuple[str, ...]
+    known: bool
+
+
+def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collection[str] | None = None) -> Judged:
+    """Judge the rest of a set. ``events``: the names of those beside it that stay (None: all)."""
+    p, c = store.problem, store.constants
+    final = store.with_events(chosen)
+    if events is not None and any(name not in events for name in final.names - chosen.names):
+        final = store.without(final, lambda e: e.effect.claims is not None and e.effect.name not in events)
+    rest = rest_of(p, final.fitted)
     quiet, loud = (is_whole(*worst_left(p, store.base.fitted, rest, doubt=doubt), c) for doubt in (False, True))
     # without a named effect the noise as estimated decides, so that the doubt is reported
     whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
-    sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
-    sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
-    least = 0.0 if whole else UNLIKELY * stated(1.0, False, c)
-    unlikely = {name for name, v in sure.items() if v < least}
-    if unlikely:
-        withheld += tuple(entry_of(store, final, k) for k, e in enumerate(final.placed) if e.effect.name in unlikely)
-        final = store.without(final, lambda e: e.effect.name in unlikely)
-        chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
-        rest = rest_of(p, final.fitted)
-        left = _with_leads(p, rest)
-    return Answer(final, sure, rivals_of(store, chosen), strange, left, rest.floors, whole, doubtful, withheld)
+    return Judged(final, rest, whole, doubtful, whole and quiet)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from tools.mismatch.engine.features import curve
+from tools.mismatch.engine.features import curve, standard
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import robust_scale
@@ -116,11 +116,17 @@ KNOTS = 10
 
 
 def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
-    """Return curves (m, k) of every input and condition, and of the simulated ``output``."""
+    """Return curves (m, k) of every input and condition and of the simulated ``output``.
+
+    A curve of a condition stands alone and beside its product with the simulated output: a gain that follows it.
+    """
     r = problem.recording
-    signals = [x[problem.index] for of in (r.inputs, r.context) for x in of.values()]
-    signals.append(problem.measured[output] - fitted.residual[output])
-    return [c for c in (curve(x, KNOTS) for x in signals) if c.shape[1]]
+    simulated = problem.measured[output] - fitted.residual[output]
+    motion = standard(simulated)[:, None]
+    conditions = [c for x in r.context.values() if (c := curve(x[problem.index], KNOTS)).shape[1]]
+    courses = [x[problem.index] for x in r.inputs.values()] + [simulated]
+    plain = [c for x in courses if (c := curve(x, KNOTS)).shape[1]]
+    return [*plain, *conditions, *(np.column_stack([c, c * motion]) for c in conditions)]
 
 
 def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,7 @@ class Store:
         old = self.sets.get(scored.key)
         if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
             self.sets[scored.key] = scored
+            self._tests = {of: z for of, z in self._tests.items() if of[0] != scored.key}
         return self.sets[scored.key]
 
     def scored(self, fitted: Fit) -> Scored:
@@ -264,7 +265,8 @@ class Store:
     def z_of(self, s: Scored, name: str) -> float:
         """Return the whitened held-out correlation of the contribution of ``name`` with the residual without it.
 
-        An effect of events or of noise has no predictable course: its own test replaces the correlation.
+        An effect of events or of noise has no predictable course: its own test replaces the correlation. The samples
+        of events beside the set do not count, because the whitening would take bursts for the colour of the noise.
         """
         if (s.key, name) not in self._tests:
             placed = [p for p in s.placed if p.effect.name == name]
@@ -276,13 +278,20 @@ class Store:
                 z = max((z_of_p(c.p_value * len(self.seen)) for c in found if c.tested), default=0.0)
             else:
                 small = self.without(s, lambda p: p.effect.name == name)
-                z = compare(self.problem, small.fitted, s.fitted).z
+                usual = {o: ~self.with_events(s).fitted.model.excused(self.problem.view, o) for o in s.density}
+                before, after = (_only(f.fitted, usual) for f in (small, s))
+                z = compare(self.problem, before, after).z
             self._tests[s.key, name] = z
         return self._tests[s.key, name]
 
     def least_z(self, s: Scored) -> float:
         """Return the weakest test of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+def _only(fitted: Fit, usual: Mapping[str, NDArray[np.bool_]]) -> Fit:
+    """Return ``fitted`` with a residual of zero outside the samples ``usual`` (m,) of each output."""
+    return replace(fitted, residual={o: np.where(usual[o], r, 0.0) for o, r in fitted.residual.items()})
 
 
 def recordings_held(problem: Problem) -> int:
