@@ -15,7 +15,7 @@ from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer.constants import START, Constants, learned
 from tools.mismatch.infer.count import Count
-from tools.mismatch.infer.decide import TESTED, accepted, is_whole, log_odds, stated, surenesses
+from tools.mismatch.infer.decide import TESTED, accepted, dispensable, is_whole, log_odds, stated, surenesses
 from tools.mismatch.infer.density import DEGREES, NORMAL, student_log_density, student_scale
 from tools.mismatch.infer.run import infer
 from tools.mismatch.infer.store import Store
@@ -102,6 +102,15 @@ def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:
     assert math.isfinite(log_odds(0.0))
 
 
+def test_a_name_that_may_be_one_too_many_is_told_from_one_of_two_equals() -> None:
+    c = replace(START, sure_open=2.0)
+    extra = [(frozenset("ab"), 0.0), (frozenset("a"), -0.2), (frozenset("b"), -30.0), (frozenset(), -60.0)]
+    equals = [(frozenset("ab"), 0.0), (frozenset("ac"), -0.2), (frozenset("a"), -30.0)]
+    assert dispensable(frozenset("ab"), extra, False, c) == {"b"}
+    assert dispensable(frozenset("ab"), equals, False, c) == set()
+    assert dispensable(frozenset("ab"), extra, True, c) == set()
+
+
 def test_the_form_of_what_is_named_may_leave_its_share() -> None:
     c = replace(START, cut=0.5, cut_share=0.05)
     assert is_whole(0.4, 0.0, c)
@@ -150,19 +159,20 @@ def test_an_effect_that_is_not_in_the_vocabulary_is_a_full_member() -> None:
     assert {a.name for a in report.alternatives} <= {e.name for e in others}
 
 
-@pytest.mark.parametrize("follows", [True, False])
-def test_a_walk_is_no_account_of_what_follows_a_recorded_signal(follows: bool) -> None:
-    """Nothing in the vocabulary is about humidity, which walks; the change is a curve of it, or a walk of its own."""
+@pytest.mark.parametrize("follows", ["offset", "gain", ""])
+def test_a_walk_is_no_account_of_what_follows_a_recorded_signal(follows: str) -> None:
+    """Nothing in the vocabulary is about humidity, which walks; the change is a curve of it, alone or times the
+    output, or a walk of its own."""
     rng = np.random.default_rng(0)
     u = 40.0 * wave(rng, N)
     humidity, other = np.cumsum(rng.standard_normal((2, N)), axis=1) / np.sqrt(N)
-    change = 0.08 * np.abs(humidity) if follows else 0.08 * other
+    change = 0.08 * {"offset": np.abs(humidity), "gain": np.abs(humidity) * 0.12 * u, "": other}[follows]
     y = 0.12 * u + change + 0.005 * rng.standard_normal(N)
     stack = {"gain_um_per_V": 0.12, "offset_um": 0.0}
     r = recording("piezo_stack", {"command": u}, {"displacement": y}, stack, context={"humidity": humidity})
     store = infer(r, START, jobs=1, effects=[EFFECTS["random_walk"]]).found.store
     (walk,) = (s for s in store.sets.values() if s.names)
-    assert walk.proper != follows
+    assert walk.proper != bool(follows)
     assert store.ranked()[0].names == (frozenset() if follows else {"random_walk"})
 
 
@@ -204,3 +214,15 @@ def test_a_limit_that_no_fitted_sample_reached_says_nothing_about_others() -> No
     (lower, upper, _) = clipped.fitted.theta[clipped.fitted.model.slices(0)[0]]
     assert upper == pytest.approx(limit, rel=0.02)
     assert lower < u.min() - 0.2 * np.ptp(u)
+
+
+def test_a_slow_drift_is_seen_beside_bursts() -> None:
+    """Whitening by a filter that has learned bursts erases a drift."""
+    rng = np.random.default_rng(6)
+    u = 40.0 * wave(rng, N)
+    change = 0.25 * (1.0 - np.exp(-np.arange(N) / 1500.0))
+    for a in rng.choice(N - 60, 4, replace=False):
+        change[a : a + 40] += 0.6 * rng.choice([-1.0, 1.0]) * np.sin(np.pi * np.arange(40) / 40)
+    effects = [EFFECTS[n] for n in ("thermal_drift", "spikes", "saturation")]
+    report = diagnose(_stack(change, u), jobs=1, constants=START, effects=effects)
+    assert {p.name for p in report.physics} == {"thermal_drift", "spikes"}

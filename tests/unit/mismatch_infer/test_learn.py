@@ -26,7 +26,6 @@ from tools.research.prove.learn import (
     traits_of,
 )
 
-
 SHORT = 3.0
 """Nats per sample by which a twin without effects is short of noise."""
 

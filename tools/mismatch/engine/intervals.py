@@ -14,6 +14,7 @@ from tools.mismatch.engine.colour import fit_whitener
 from tools.mismatch.engine.fit import Fit, moved_a_little
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import HUBER, robust_scale
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.trust import TIMES_GIVEN, TIMES_SCALE
 from tools.mismatch.simulate import Model
 
@@ -30,18 +31,27 @@ def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
     rows = problem.fit_rows[:: max(1, stride)]
     outputs = problem.twin.outputs
     found = np.zeros((rows.size * len(outputs), theta.size))
-    smooth = Model(problem.twin, [p for p in model.placed if p.effect.name != "quantization"])
-    if len(smooth.placed) < len(model.placed):
-        at = smooth.carry(model, theta, problem.recording)
+    smooth = before_rounding(problem, fitted)
+    if smooth is not fitted:
         names = [p.name for p in model.parameters]
-        before = [names.index(p.name) for p in smooth.parameters]
-        found[:, before] = jacobian(problem, replace(fitted, model=smooth, theta=at), stride)
+        before = [names.index(p.name) for p in smooth.model.parameters]
+        found[:, before] = jacobian(problem, smooth, stride)
         return _moved(problem, model, theta, rows, found, [i for i in range(theta.size) if i not in before])
     design = model.design(problem.view, theta, samples=problem.index[rows])
     for k, o in enumerate(outputs):
         for i, j in enumerate(design.linear[o]):
             found[k * rows.size : (k + 1) * rows.size, j] = design.columns[o][:, i] / problem.sigma(o)
     return _moved(problem, model, theta, rows, found, model.nonlinear)
+
+
+def before_rounding(problem: Problem, fitted: Fit) -> Fit:
+    """Return ``fitted`` without its quantisers, the residual of which contains the error of rounding."""
+    model = fitted.model
+    smooth = Model(problem.twin, [p for p in model.placed if p.effect.name != "quantization"])
+    if len(smooth.placed) == len(model.placed):
+        return fitted
+    at = smooth.carry(model, fitted.theta, problem.recording)
+    return replace(fitted, model=smooth, theta=at, residual=residuals(problem, smooth, at))
 
 
 def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Array, which: Sequence[int]) -> Array:
@@ -120,7 +130,9 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     stride = max(1, problem.fit_rows.size * len(problem.twin.outputs) // 200_000)
     j = jacobian(problem, fitted, stride)
     rows = problem.fit_rows[::stride]
-    r = np.concatenate([fitted.residual[o][rows] / problem.sigma(o) for o in problem.twin.outputs])
+    # a rounding that is explained exactly is still what the parameters are uncertain by (Widrow and Kollar 2008)
+    smooth = before_rounding(problem, fitted)
+    r = np.concatenate([smooth.residual[o][rows] / problem.sigma(o) for o in problem.twin.outputs])
     limit = HUBER * robust_scale(r, 1.0)
     r = np.clip(r, -limit, limit)
     size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
@@ -139,7 +151,7 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     scale = np.where(idle, 0.0, 1.0 / size)
     own = np.where(idle, (_ranges(fitted) / 3.92) ** 2, 0.0)
     both = np.outer(scale, scale)
-    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, fitted))
+    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth))
 
 
 def few_blocks(moved: Array) -> Array:

@@ -40,4 +40,3 @@ class Count:
         """Return the nats that a set gains by removing ``share`` of its residual's variance, down to the noise."""
         better = short + 0.5 * math.log(max(1.0 - share, 1e-12))
         return max(self.lost(short) - self.lost(max(better, 0.0)), 0.0)
-
