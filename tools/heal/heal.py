@@ -15,6 +15,7 @@ from tools.errors import InputError
 from tools.heal.experiments import StackTwin, twin_of_stack
 from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
 from tools.heal.parts import PARTS, Comparison, Lab, Part
+from tools.heal.without_remedy import WITHOUT_REMEDY
 from tools.output import write_text_atomic
 
 VERIFY_FROM = 1000
@@ -34,7 +35,7 @@ Say = Callable[[str], None]
 class Step:
     """Records the treatment of a part: misfit, effects that the engine named, and if and why its remedy was kept.
 
-    ``no_remedy`` lists the named effects that the firmware cannot compensate, ``split`` those for which an experiment
+    ``no_remedy`` lists what was found that the firmware cannot compensate, ``split`` those for which an experiment
     was planned and played. ``twin`` is the corrected twin of the stack that differed most.
     """
 
@@ -97,6 +98,8 @@ def heal(
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
         effects = _named(compared, jobs) if name_effects else ()
+        beyond = WITHOUT_REMEDY[part.name](lab, jobs) if name_effects and part.name in WITHOUT_REMEDY else ()
+        named = effects, (*(e for e in effects if e not in STACK_EFFECTS), *beyond)
         twin: StackTwin | None = None
         if name_effects and compared.axis is not None:
             say(f"{part.name}: the twin of stack {compared.axis + 1}")
@@ -108,10 +111,10 @@ def heal(
             candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
             after = tip_error(candidate, seconds, seeds)
         except InputError as error:
-            steps.append(_step(part, compared, effects, (False, str(error)), now, twin))
+            steps.append(_step(part, compared, named, (False, str(error)), now, twin))
             continue
         kept, why = is_better(now, after)
-        steps.append(_step(part, compared, effects, (kept, why), after, twin))
+        steps.append(_step(part, compared, named, (kept, why), after, twin))
         if kept:
             bench, now = candidate, after
         else:
@@ -161,13 +164,12 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
 
 
 def _step(
-    part: Part, compared: Comparison, effects: tuple[str, ...], verdict: tuple[bool, str], after: TipError,
-    twin: StackTwin | None,
+    part: Part, compared: Comparison, named: tuple[tuple[str, ...], tuple[str, ...]], verdict: tuple[bool, str],
+    after: TipError, twin: StackTwin | None,
 ) -> Step:  # fmt: skip
-    none = tuple(e for e in effects if e not in STACK_EFFECTS)
     file = str(twin.file) if twin is not None and twin.file is not None else None
     split = twin.split if twin is not None else ()
-    return Step(part.name, compared.rms, compared.unit, effects, none, *verdict, after.mean(), file, split)
+    return Step(part.name, compared.rms, compared.unit, *named, *verdict, after.mean(), file, split)
 
 
 def lines(healed: Healed) -> list[str]:
