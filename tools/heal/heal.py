@@ -11,6 +11,7 @@ from typing import Any
 from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from sim_devices.config import emulation_config
 from tools.bench.bench_copy import with_calibration
+from tools.closed_loop.simulate import COMMAND_DELAY_S, wires_of
 from tools.errors import InputError
 from tools.heal.experiments import StackTwin, twin_of_stack
 from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
@@ -82,6 +83,7 @@ def check_bench(bench: BenchFile, max_effect: int | None) -> None:
         )
     if emulation_config(bench.description.model_dump()).endoscope is not None:
         raise InputError(f"{bench.path}: an endoscope bench has no tip that is compensated; name an instrument's bench")
+    wires_of(bench, 0, COMMAND_DELAY_S)  # raises InputError for a bench whose runs cannot be simulated
 
 
 def heal(

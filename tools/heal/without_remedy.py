@@ -6,6 +6,8 @@ names in the tip's record after the best geometry has been taken off.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.stats import linregress
 
@@ -36,7 +38,7 @@ def name_temperature(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
             warm, noise = _warmer(lab.config, kelvin), f"chamber.{k}"
             columns, _ = measure_volts(warm, axis, volts, LOOPS_HZ, noise=noise, what="", twin=twin)
             gains.append(float(np.polyfit(volts, columns["displacement_um"], 1)[0]))
-        line = linregress(WARMER_K, gains)
+        line: Any = linregress(WARMER_K, gains)
         if line.pvalue < LEVEL / 3:
             share = line.slope / float(np.mean(gains))
             named.append(f"stack {axis + 1} {share:+.2%} per kelvin")
@@ -60,7 +62,7 @@ def beyond_geometry(lab: Lab) -> Recording:
     columns = measure_tip(lab.config, TIP_S)
     modelled = tip_um(np.array([fit.parameters[n].value for n in NAMES]), columns["stroke_um"])
     table: dict[str, np.ndarray] = {}
-    channels: list[dict[str, object]] = []
+    channels: list[dict[str, Any]] = []
     for i, axis in enumerate("xy"):
         table |= {f"model_{axis}": modelled[:, i], f"tip_{axis}": columns["tip_um"][:, i]}
         channels += [
