@@ -43,6 +43,11 @@ def band_name(band_hz: tuple[float, float]) -> str:
     return f"below {high_hz:g} Hz" if low_hz <= 0.0 else f"{low_hz:g}-{high_hz:g} Hz"
 
 
+def density_text(um_rtHz: float) -> str:
+    """Return a density in five characters or less: 0.123, 12.3, 123."""
+    return f"{um_rtHz:.{3 if um_rtHz < 1.0 else 1 if um_rtHz < 100.0 else 0}f}"
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """Holds amplitude densities of the tip's error as a vector, um/sqrt(Hz), in the third octaves of ``hz``."""

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
-from tools.reports.figures import AXES, FOUR_BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, band_name, band_pass
+from tools.reports.figures import AXES, FOUR_BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, band_name, band_pass, density_text
 
 Array = NDArray[np.float64]
 NOTHING_UM = 0.2
@@ -83,7 +83,7 @@ def spectrum_table(result: Mapping[str, Any]) -> Table:
     for column in ("Hz", *(f"{spectrum['hz'][n]:g}" for n in at)):
         table.add_column(column, justify="left" if column == "Hz" else "right", no_wrap=True)
     for name in ("without", "with"):
-        table.add_row(name, *(f"{spectrum[f'{name}_um_rtHz'][n]:.2g}" for n in at))
+        table.add_row(name, *(density_text(spectrum[f"{name}_um_rtHz"][n]) for n in at))
     return table
 
 

@@ -89,8 +89,8 @@ def test_the_page_has_the_spectrum_of_the_default_estimator_and_names_what_no_se
     swing = Swing(9.0, 3.0, 0.9, 74.0, 5.0)
     rows = [HandRow("a|b", "data.npz#305:365", method, figures, 1.5, 4.0, 2.0, swing) for method in METHODS]
     page = markdown(rows, 8.0, "x")
-    assert "| a\\|b | - | - | - | 3 -> 0.5 | 12 -> 1.2 | - |" in page
-    assert page.count("12 -> 1.2") == 1
+    assert "| a\\|b | - | - | - | 3.0 -> 0.500 | 12.0 -> 1.2 | - |" in page
+    assert page.count("12.0 -> 1.2") == 1
     assert "No setting was chosen on the part that is scored: a|b (305:365 s)." in page
 
 
@@ -110,19 +110,18 @@ def test_above_the_band_a_known_tremor_within_the_strokes_leaves_the_hand_and_a_
     assert found.tip_um == pytest.approx(3.0 * one, rel=0.01)
 
 
-def test_the_page_says_where_the_strokes_alone_miss_the_goal_above_the_band() -> None:
+def test_the_page_says_what_is_added_above_the_band_and_what_room_the_strokes_leave() -> None:
     vector = BandFigures(20.0, 4.0, 80.0)
     bands = dict.fromkeys(BANDS_HZ, vector)
     figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, bands, 1.0, 0.0)
     swing = Swing(9.0, 3.0, 0.9, 74.0, 5.0)
     rows = [
-        HandRow(name, "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, 30.0, AboveBand(0.5, known_um, 1.5, tip_um))
-        for name, known_um, tip_um in (("still", 0.5, 1.9), ("wide", 2.1, 3.5), ("shaken", 0.6, 2.2))
+        HandRow(name, "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, 30.0, above)
+        for name, above in (("still", AboveBand(3.0, 2.9, 3.1, 3.4)), ("wide", AboveBand(0.9, 1.5, 1.5, 4.1)))
     ]
     page = markdown(rows, 8.0, "x")
-    assert "| still | 0.50 | 0.50 | 1.50 | 1.90 | met |" in page
-    assert "| wide | 0.50 | 2.10 | 1.50 | 3.50 | missed; the strokes alone miss it |" in page
-    assert "| shaken | 0.50 | 0.60 | 1.50 | 2.20 | missed |" in page
+    assert "| still | 3.00 | 3.40 | 1.60 | 0.00 | 2.00 | 0.78 | met |" in page
+    assert "| wide | 0.90 | 4.10 | 4.00 | 1.20 | 1.60 | 1.20 | missed |" in page
 
 
 def test_parts_that_no_setting_has_seen_are_of_hands_that_are_run() -> None:

@@ -107,6 +107,10 @@ class AboveBand:
     wish_um: float
     tip_um: float
 
+    def added_um(self, whole_um: float) -> float:
+        """Return what is added to the hand's own motion where ``whole_um`` is left: root of the powers' difference."""
+        return float(np.sqrt(max(whole_um**2 - self.hand_um**2, 0.0)))
+
 
 def above_band(
     truth: Mapping[str, Array], frames: Array, keep: NDArray[np.bool_], body: Array, config: ActuationConfig

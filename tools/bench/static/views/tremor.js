@@ -10,7 +10,7 @@ const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahea
 const BANDS = [[0, 2], [2, 8], [8, 12], [20, 500]];
 const SLOW = [...AXES.map((a) => `tremor_amplitude_${a}`), ...AXES.map((a) => `tremor_frequency_${a}`)];
 const UM = 1e6;
-const DECADES = 4; // of the spectrum, below its highest line
+const DECADES = 5; // of the spectrum, below its highest line
 const PATH = 700;
 const COMMANDED = 128;
 const MANUAL = 256;
