@@ -15,12 +15,14 @@ from drivers.specs import check_devices
 from firmware_py.machine.settings import read_machine
 from firmware_py.machine.tree import Tree
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
-from hal.bench import BenchFile, OpenBench, Port, open_bench
+from hal.bench import BenchFile, OpenBench, Port, SerialSpec, open_bench
 from hal.clock import Pace, PacedClock
 from hal.contracts import Clock
 from hal.errors import Disconnected
 
 LOOP_PRIORITY = 80
+WORKER_PRIORITY = 70
+"""SCHED_FIFO priority of the kernel's threads that bring the bytes of ttys: between the loop and other programs."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,17 @@ def scheduling(request: RunRequest, opened: OpenBench) -> Generator[RealtimeRepo
     if opened.virtual or not request.policy:
         yield RealtimeReport()
         return
-    with realtime(RealtimeConfig(priority=LOOP_PRIORITY, cpu=request.cpu, idle_exit_us=0)) as report:
+    config = RealtimeConfig(
+        priority=LOOP_PRIORITY, cpu=request.cpu, idle_exit_us=0,
+        worker_priority=WORKER_PRIORITY if has_ttys(opened.file) else None,
+    )  # fmt: skip
+    with realtime(config) as report:
         yield report
+
+
+def has_ttys(bench: BenchFile) -> bool:
+    """Return True if a bus of ``bench`` is a serial port, or CAN over one."""
+    return any(isinstance(spec, SerialSpec) or "slcan" in spec.uri for spec in bench.description.bus.values())
 
 
 def serial_ports(bench: BenchFile) -> list[str]:

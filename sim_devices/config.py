@@ -192,6 +192,8 @@ class AmplifierConfig(_Table):
     high_V: float = 100.0
     output_ohm: Positive = 10.0
     stack_farad: Positive = 1.5e-6
+    gain_per_K: float = 0.0
+    """Relative change of the gain for each kelvin above 25 degC."""
     neutral_V: float = 50.0
     """Output without a command, in V."""
 
@@ -222,6 +224,8 @@ class ManipulatorConfig(_Table):
     """Relative, of circle and shaft."""
     rest_spread_um: NotNegative = 20.0
     """Ball heights at neutral: what the calibration screws leave (Ang 2004, 6.2)."""
+    mount_play_um: NotNegative = 0.0
+    """Play of a loose mount, along each axis of the body: after a reversal the tip stands still for so much motion."""
 
 
 class EnvironmentConfig(_Table):
@@ -257,6 +261,8 @@ class DaqConfig(_Table):
     """Number of samples that a DI-4108 keeps for a host that does not read: 128 ms of eight channels at 1 kHz.
 
     A value above that of the real part serves a test machine that suspends the process for longer than that."""
+    delay_ms: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Age of an accelerometer's voltage when it is converted, as behind a digital filter of linear phase."""
 
 
 class MoreAxis(_Table):
@@ -339,6 +345,12 @@ class EmulationConfig(_Table):
     more_axes: tuple[MoreAxis, ...] = Field(default=(), max_length=2)
     twin: str | tuple[str, str, str] | None = None
     """Corrected twin (``micron mismatch apply``) in place of the stacks, or one for each; relative to the bench."""
+
+    @model_validator(mode="after")
+    def _delayed_alike(self) -> EmulationConfig:
+        if self.daq.delay_ms and self.more_axes:
+            raise ValueError("daq.delay_ms delays six accelerometer axes only; it cannot be combined with more_axes")
+        return self
 
 
 def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:

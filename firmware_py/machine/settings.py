@@ -15,6 +15,7 @@ from typing import Literal
 
 from firmware_py.machine.processors import format_processors, parse_processors
 from firmware_py.machine.tree import DMA_LATENCY, Tree, read_latency_limit_us
+from firmware_py.machine.workers import find_workers, has_ordinary_workers, may_raise
 
 Lasts = Literal["run", "boot", "kernel"]
 CPUS = "sys/devices/system/cpu"
@@ -56,6 +57,18 @@ def _latency_limit(tree: Tree, _ports: Sequence[str]) -> list[Reading]:
     if is_ours := limit_us > 0 and tree.may_write(DMA_LATENCY):
         value += ", but a run holds it at 0 us"
     return [Reading(DMA_LATENCY, "cpu_dma_latency", value, limit_us == 0 or is_ours)]
+
+
+def _tty_workers(tree: Tree, _ports: Sequence[str]) -> list[Reading]:
+    if not find_workers(tree):
+        return []
+    if not has_ordinary_workers(tree):
+        return [Reading("proc", WORKERS, "real-time priority", True)]
+    is_ours = may_raise(tree)
+    return [Reading("proc", WORKERS, "ordinary priority" + (", but a run raises it" if is_ours else ""), is_ours)]
+
+
+WORKERS = "kworker/u*"
 
 
 def _isolated(tree: Tree, _ports: Sequence[str]) -> list[Reading]:
@@ -169,6 +182,12 @@ SETTINGS = (
         "a processor that sleeps deeply needs up to some 100 us to wake up for a scan",
         "let your user write /dev/cpu_dma_latency (docs/lab-machine.md): `micron run` then holds it at 0 us",
         _latency_limit,
+    ),
+    MachineSetting(
+        "workers of ttys", "real-time priority", "run",
+        "bytes of a serial port wait up to 4 ms for a kernel thread while another program uses the processor",
+        "run as root or with the capability CAP_SYS_NICE: `micron run --realtime` then raises these threads",
+        _tty_workers,
     ),
     MachineSetting(
         "isolated processors", "one", "kernel",

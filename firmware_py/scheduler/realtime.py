@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 from firmware_py.machine.tree import MACHINE, Tree, hold_latency_limit
+from firmware_py.machine.workers import raise_workers
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h, Linux
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
@@ -26,6 +27,7 @@ class RealtimeConfig:
     ``priority`` is SCHED_FIFO's 1..99 (the policy is not inherited by child processes), ``cpu`` the
     processor to stay on. Child processes and threads started while pinned inherit the pinning: start them before.
     ``idle_exit_us``: the longest time that a processor may take to wake up (/dev/cpu_dma_latency), 0: no idle states.
+    ``worker_priority``: SCHED_FIFO priority of the kernel's threads that bring the bytes of ttys.
     """
 
     priority: int | None = 50
@@ -34,6 +36,7 @@ class RealtimeConfig:
     timer_slack_ns: int | None = 1
     freeze_gc: bool = True
     idle_exit_us: int | None = None
+    worker_priority: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,8 @@ def realtime(config: RealtimeConfig, tree: Tree = MACHINE) -> Generator[Realtime
             attempt("cpu", f"cpu {cpu}", lambda: _pin(cpu))
         if slack_ns is not None:
             attempt("timer_slack", f"{slack_ns} ns", lambda: _timer_slack(slack_ns))
+        if (worker := config.worker_priority) is not None:
+            attempt("tty_workers", f"SCHED_FIFO {worker}", lambda: raise_workers(tree, worker))
         if config.lock_memory:
             attempt("lock_memory", "touched memory locked", _lock_memory)
         if config.freeze_gc:

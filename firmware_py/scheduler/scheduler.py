@@ -62,10 +62,10 @@ class _LiveTask:
 class _Ignored:
     """Holds the counters of one announced one-off."""
 
-    __slots__ = ("overruns", "skipped_ticks", "slips", "ticks", "worst_lateness_ns", "worst_tick_ns")
+    __slots__ = ("caught_up", "overruns", "skipped_ticks", "slips", "ticks", "worst_lateness_ns", "worst_tick_ns")
 
     def __init__(self) -> None:
-        self.ticks = self.skipped_ticks = self.overruns = self.slips = 0
+        self.ticks = self.caught_up = self.skipped_ticks = self.overruns = self.slips = 0
         self.worst_tick_ns = self.worst_lateness_ns = 0
 
 
@@ -159,7 +159,7 @@ class Scheduler:
         started_ns = self._now_ns()
         info = TickInfo(k, due_ns, started_ns, self._advance_scan(k))
         self._caught_up += 1
-        self._run(self._due_late[k % self._hyperperiod], info, info)
+        self._run(self._due_late[k % self._hyperperiod], info, info, is_late=True)
         return info
 
     def run(self, ticks: Ticks) -> TickInfo:
@@ -273,10 +273,13 @@ class Scheduler:
         scan_info: TickInfo,
         *,
         beside: bool = False,
+        is_late: bool = False,
         may_put_off: bool = True,
     ) -> None:
         now_ns = self._now_ns
-        ignored = self._ignored[self._ignoring.pop()] if self._ignoring and not beside else None
+        ignored = self._ignored[self._ignoring[-1]] if self._ignoring and not beside else None
+        if ignored and not is_late:  # what is caught up with before the announced tick belongs to it
+            self._ignoring.pop()
         due_ns, k = info.due_ns, info.k
         done = 0
         try:
@@ -319,7 +322,8 @@ class Scheduler:
             tick_ns = now_ns() - info.started_ns
             lateness_ns = info.started_ns - due_ns
             if ignored:
-                ignored.ticks += 1
+                ignored.caught_up += is_late
+                ignored.ticks += not is_late
                 ignored.worst_tick_ns = max(ignored.worst_tick_ns, tick_ns)
                 ignored.worst_lateness_ns = max(ignored.worst_lateness_ns, lateness_ns)
             elif not beside:
@@ -349,7 +353,8 @@ class Scheduler:
     # -- statistics --------------------------------------------------------------------------------------
 
     def ignore_next(self, reason: str, ticks: int = 1) -> None:
-        """Count the next ``ticks`` ticks apart, under ``reason``: an announced one-off (warm-up, gc)."""
+        """Count the next ``ticks`` ticks, and what is caught up with before them, apart, under ``reason``: an announced
+        one-off (warm-up, gc)."""
         self._ignored.setdefault(reason, _Ignored())
         self._ignoring = [reason] * ticks + self._ignoring
 
@@ -407,6 +412,7 @@ class Scheduler:
                 IgnoredSnapshot(
                     reason=reason,
                     ticks=counted.ticks,
+                    caught_up=counted.caught_up,
                     skipped_ticks=counted.skipped_ticks,
                     overruns=counted.overruns,
                     slips=counted.slips,

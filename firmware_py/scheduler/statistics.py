@@ -78,10 +78,12 @@ class BackgroundSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class IgnoredSnapshot:
-    """Counts the ticks of an announced one-off (``ignore_next``) apart, but does not hide them."""
+    """Counts the ticks of an announced one-off (``ignore_next``) apart, but does not hide them: ``caught_up`` and
+    ``skipped_ticks`` are in the scheduler's totals, too."""
 
     reason: str
     ticks: int
+    caught_up: int
     skipped_ticks: int
     overruns: int
     slips: int
@@ -91,6 +93,7 @@ class IgnoredSnapshot:
     def as_dict(self) -> dict[str, object]:
         return {
             "ticks": self.ticks,
+            "caught_up": self.caught_up,
             "skipped_ticks": self.skipped_ticks,
             "overruns": self.overruns,
             "slips": self.slips,

@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.compiled import kernel
 from sim_devices.plant.hand_kernel import between, pose_between
-from sim_devices.plant.manipulator import tip_displacement
+from sim_devices.plant.manipulator import take_up, tip_displacement
 from sim_devices.plant.rigid_body import attitude, body_rates, quaternion, specific_force
 from sim_devices.plant.sensors import ACCELEROMETER, accelerometer_V
 from sim_devices.plant.stack import DRIVE, DRIVE_STATE, drive_step
@@ -21,6 +21,8 @@ NOISES = 17
 """Standard normal numbers per step: 6 accelerometers, 8 DAQ inputs, 3 magnetometer outputs."""
 SLOW_NOISES = 2
 """Per millisecond: ambient temperature, supply."""
+PAST = 82
+"""Accelerometer voltages that are kept: those of 10 ms, and one more on each side."""
 
 TRUTH = (
     ("tip_m", 0, 3),
@@ -43,6 +45,7 @@ PLANT = np.dtype(
         ("mount", "f8", (3, 3)),  # manipulator to body
         ("rest_m", "f8", (3,)),  # ball heights at neutral
         ("rest_tip_m", "f8", (3,)),
+        ("play_m", "f8"),
         ("frame", "f8", (3, 3)),
         ("arm_m", "f8", (3, 3)),  # sensor locations from the tip, body
         ("gravity", "f8"),
@@ -68,6 +71,8 @@ PLANT = np.dtype(
         ("daq_gain", "f8", (8,)),
         ("daq_offset_V", "f8", (8,)),
         ("daq_noise_V", "f8"),
+        ("daq_delay_s", "f8"),
+        ("sense_s", "f8"),  # between two calls of ``sense``
     ]
 )
 
@@ -90,6 +95,9 @@ STATE = np.dtype(
         ("supply_V", "f8"),
         ("sensor_V", "f8", (6,)),  # before the RC
         ("rc_V", "f8", (6,)),
+        ("past_V", "f8", (PAST, 6)),  # ``rc_V`` of the last steps, in a ring
+        ("newest", "i8"),
+        ("seat_m", "f8", (3,)),  # tip displacement behind the play of the mount
         ("noise", "f8", (NOISES,)),
         ("clipped", "i8", (6,)),  # steps in which an accelerometer was out of range
         ("strap", "f8"),
@@ -138,6 +146,18 @@ def sense(p, s, noise):
         keep = a["rc_keep"]
         s["rc_V"][i] = keep * s["rc_V"][i] + a["rc_from"] * s["sensor_V"][i] + a["rc_to"] * v + (1.0 - keep) * hiss
         s["sensor_V"][i] = v
+    s["newest"] = (s["newest"] + 1) % PAST
+    copy(s["rc_V"], s["past_V"][s["newest"]])
+
+
+@kernel
+def past_V(p, s, i, ago_s):
+    """Return accelerometer ``i`` behind its RC filter, ``ago_s`` before the last step, in V."""
+    steps = ago_s / p["sense_s"]
+    whole = int(steps)
+    part = steps - whole
+    at = s["newest"] - whole
+    return (1.0 - part) * s["past_V"][at % PAST, i] + part * s["past_V"][(at - 1) % PAST, i]
 
 
 @kernel
@@ -152,8 +172,11 @@ def outputs(p, s, later_s):
     for i in range(8):
         if i < 6:
             v = s["rc_V"][i]
-            if later_s > 0.0:
-                v = s["sensor_V"][i] + (v - s["sensor_V"][i]) * math.exp(-later_s / p["accelerometer"][i]["rc_s"])
+            ahead_s = later_s - p["daq_delay_s"]
+            if ahead_s > 0.0:
+                v = s["sensor_V"][i] + (v - s["sensor_V"][i]) * math.exp(-ahead_s / p["accelerometer"][i]["rc_s"])
+            elif ahead_s < 0.0:
+                v = past_V(p, s, i, -ahead_s)
         elif i == 6:
             v = supply * p["divider"]
         else:
@@ -190,6 +213,7 @@ def truth_row(p, s, part, row):
     e, m, rest = np.empty(3), p["mount"], p["rest_tip_m"]
     for i in range(3):
         e[i] = m[i, 0] * (d[0] - rest[0]) + m[i, 1] * (d[1] - rest[1]) + m[i, 2] * (d[2] - rest[2])
+    take_up(p["play_m"], s["seat_m"], e)
     c = s["attitude"]
     for i in range(3):
         rigid = s["pose"][i]
@@ -209,6 +233,8 @@ def begin(plant, state, node, part, truth):
     copy(node, s["pose"])
     sense(p, s, s["noise"])
     copy(s["sensor_V"], s["rc_V"])
+    for k in range(PAST):
+        copy(s["rc_V"], s["past_V"][k])
     outputs(p, s, 0.0)
     truth_row(p, s, part, truth)
 

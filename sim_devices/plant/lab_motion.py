@@ -119,6 +119,7 @@ def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[
     plant, state = plant_arrays(config, build_unit(config, config.unit), holding_frame(config.hand))
     # one step per millisecond: the RC filters are exact for input that is linear in between
     plant[0]["accelerometer"] = sensor_unit(config.sensors, config.instrument, config.unit, NODE_S).accelerometers
+    plant[0]["sense_s"] = NODE_S
     begin(plant, state, nodes[0] if kind == "shake" else np.zeros(18), np.zeros(6), np.zeros(TRUTH_COLUMNS))
     rng = stream(config.seed, f"lab.{kind}")
     analog, magnet, held = np.empty((n, 8)), np.empty((n, 3)), np.zeros(3)

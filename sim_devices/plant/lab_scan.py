@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import STEP_S
-from sim_devices.plant.manipulator import tip_displacement
+from sim_devices.plant.manipulator import take_up, tip_displacement
 from sim_devices.plant.stack import drive_channel, drive_step
 from sim_devices.plant.unit import build_unit, start_temperature_C
 
@@ -44,7 +44,7 @@ def measure_scan(config: EmulationConfig, per_axis: int, rng: np.random.Generato
     m = unit.manipulator
     grid = scan_grid(per_axis)
     stroke, tip = np.empty((len(grid), 3)), np.empty((len(grid), 3))
-    z, rest, at = np.empty(3), np.empty(3), np.empty(3)
+    z, rest, at, seat = np.empty(3), np.empty(3), np.empty(3), np.zeros(3)
     tip_displacement(m.rest_m, m.circle_m, m.shaft_m, rest)
     for k, volts in enumerate(grid):
         for i, (params, state) in enumerate(channels):
@@ -54,6 +54,7 @@ def measure_scan(config: EmulationConfig, per_axis: int, rng: np.random.Generato
             z[i] = m.rest_m[i] + m.lever[i] * stroke[k, i]
         tip_displacement(z, m.circle_m, m.shaft_m, at)
         tip[k] = m.mount @ (at - rest)
+        take_up(m.play_m, seat, tip[k])
     noise = rng.standard_normal((2, len(grid), 3)) / np.sqrt(SAMPLES)
     columns = {
         "command_V": grid,

@@ -21,13 +21,14 @@ from sim_devices.plant.streams import stream
 @dataclass(frozen=True)
 class ManipulatorUnit:
     """Holds one manipulator: ``lever`` (3,) gains, ``rest_m`` (3,) ball heights at neutral, ``mount`` (3, 3) its frame
-    to the body's."""
+    to the body's, and its play ``play_m`` there."""
 
     circle_m: float
     shaft_m: float
     lever: NDArray[np.float64]
     rest_m: NDArray[np.float64]
     mount: NDArray[np.float64]
+    play_m: float
 
 
 def manipulator_unit(config: ManipulatorConfig, seed: int) -> ManipulatorUnit:
@@ -40,6 +41,7 @@ def manipulator_unit(config: ManipulatorConfig, seed: int) -> ManipulatorUnit:
         lever=config.lever_gain * (1.0 + config.lever_spread * draw[:3]),
         rest_m=config.rest_spread_um * 1e-6 * more[4:],
         mount=rotation(turn),
+        play_m=config.mount_play_um * 1e-6,
     )
 
 
@@ -67,3 +69,14 @@ def tip_displacement(z, circle_m, shaft_m, out):
     out[0] = circle_m * (ay * ay - ax * ax) / (2.0 * (1.0 + az)) + shaft_m * ax
     out[1] = circle_m * ax * ay / (1.0 + az) + shaft_m * ay
     out[2] = (z[0] + z[1] + z[2]) / 3.0 - shaft_m * drop / (1.0 + az)
+
+
+@kernel
+def take_up(play_m, seat_m, e):
+    """Change the displacement ``e`` (3,) in m to what is left of it behind a play; ``seat_m`` (3,) is its memory.
+
+    A second call with the same ``e`` changes nothing.
+    """
+    for i in range(3):
+        seat_m[i] = min(max(seat_m[i], e[i] - 0.5 * play_m), e[i] + 0.5 * play_m)
+        e[i] = seat_m[i]

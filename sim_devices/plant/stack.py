@@ -27,6 +27,8 @@ from sim_devices.plant.streams import stream
 Array = NDArray[np.float64]
 
 SLIPS = 12
+REFERENCE_C = 25.0
+"""Temperature at which the amplifier has its nominal gain."""
 CREEPS = 5
 CREEP_TIMES_S = (0.05, 0.5, 5.0, 50.0, 500.0)
 
@@ -39,6 +41,7 @@ DRIVE = np.dtype(
         ("lag", "f8"),  # 1 - exp(-step / tau)
         ("output_lag", "f8"),
         ("farad", "f8"),
+        ("gain_per_K", "f8"),
         ("threshold_V", "f8", (SLIPS,)),
         ("weight", "f8", (SLIPS,)),
         ("slip_keep", "f8", (SLIPS,)),
@@ -139,7 +142,8 @@ def effective_drive(p, s, change_V, stack_V):
 @kernel
 def drive_step(p, s, demand_V, temperature_C):
     """Make one step of amplifier and stack at a demand (V) held over the step. The stroke is ``s["mode"][0]``, in m."""
-    target = min(max(demand_V, p["low_V"]), p["high_V"])
+    gain = 1.0 + p["gain_per_K"] * (temperature_C - REFERENCE_C)
+    target = min(max(gain * demand_V, p["low_V"]), p["high_V"])
     move = (target - s["amplifier_V"]) * p["lag"]
     slew = p["slew_step_V"]
     s["amplifier_V"] += min(max(move, -slew), slew)
@@ -191,6 +195,8 @@ def drive_channel(
 
     The stack has been driven over its whole range, then up from 0 V to neutral, and has crept to its end there.
     """
+    gain = 1.0 + amplifier.gain_per_K * (temperature_C - REFERENCE_C)
+    rest_V = min(max(gain * amplifier.neutral_V, amplifier.low_V), amplifier.high_V)
     params, state = np.zeros(1, DRIVE), np.zeros(1, DRIVE_STATE)
     p, s = params[0], state[0]
     p["step_s"] = step_s
@@ -198,7 +204,7 @@ def drive_channel(
     p["slew_step_V"] = amplifier.slew_V_per_ms * 1e3 * step_s
     p["lag"] = -math.expm1(-2.0 * math.pi * amplifier.bandwidth_hz * step_s)
     p["output_lag"] = -math.expm1(-step_s / (amplifier.output_ohm * amplifier.stack_farad))
-    p["farad"] = amplifier.stack_farad
+    p["farad"], p["gain_per_K"] = amplifier.stack_farad, amplifier.gain_per_K
     p["threshold_V"], p["weight"], p["slip_bias"] = unit.threshold_V, unit.weight, unit.slip_bias
     p["curvature"], p["creep_share"] = unit.curvature, unit.creep_per_decade
     p["creep_lag"] = -np.expm1(-step_s / np.array(CREEP_TIMES_S))
@@ -211,9 +217,9 @@ def drive_channel(
     high_y = sweep(p, s, up)
     p["low_y"], p["swing_y"], p["stroke_m"] = low_y, high_y - low_y, unit.stroke_m
     sweep(p, s, down)
-    y = (sweep(p, s, np.linspace(0.0, amplifier.neutral_V, 401)) - low_y) / (high_y - low_y)
+    y = (sweep(p, s, np.linspace(0.0, rest_V, 401)) - low_y) / (high_y - low_y)
     rest_m = unit.stroke_m * (y + unit.curvature * (y * y - y))
-    s["amplifier_V"] = s["stack_V"] = amplifier.neutral_V
+    s["amplifier_V"] = s["stack_V"] = rest_V
     s["mode"][0] = s["drive_m"] = p["reference_m"] = rest_m
     p["slip_keep"] = np.exp(-step_s / unit.slip_time_s)
     p["slip_gain"] = (1.0 - p["slip_keep"]) * unit.slip_time_s / step_s

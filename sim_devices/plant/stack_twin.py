@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from hal.errors import BenchError
-from sim_devices.plant.manipulator import tip_displacement
+from sim_devices.plant.manipulator import take_up, tip_displacement
 
 if TYPE_CHECKING:
     from sim_devices.twin_file import FileTwin
@@ -70,13 +70,14 @@ def move_tips(plant, strokes_m, quaternions, rigid_m, tips_m):
     """``tips_m`` (n, 3), world, m, for strokes (n, 3) beyond neutral, attitudes (n, 4) and the tip at rest (n, 3)."""
     p = plant[0]
     m, rest = p["mount"], p["rest_tip_m"]
-    z, d, e = np.empty(3), np.empty(3), np.empty(3)
+    z, d, e, seat = np.empty(3), np.empty(3), np.empty(3), np.zeros(3)
     for n in range(strokes_m.shape[0]):
         for i in range(3):
             z[i] = p["rest_m"][i] + p["lever"][i] * strokes_m[n, i]
         tip_displacement(z, p["circle_m"], p["shaft_m"], d)
         for i in range(3):
             e[i] = m[i, 0] * (d[0] - rest[0]) + m[i, 1] * (d[1] - rest[1]) + m[i, 2] * (d[2] - rest[2])
+        take_up(p["play_m"], seat, e)
         w, x, y, v = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
         # e + 2 w (u x e) + 2 u x (u x e), u = (x, y, v)
         a, b, c = y * e[2] - v * e[1], v * e[0] - x * e[2], x * e[1] - y * e[0]

@@ -55,7 +55,7 @@ def plant_arrays(config: EmulationConfig, unit: Unit, frame: NDArray[np.float64]
         p["channel"][i], s["channel"][i] = channel[0], channel_state[0]
     m, sensors, e = unit.manipulator, unit.sensors, config.environment
     p["circle_m"], p["shaft_m"], p["lever"] = m.circle_m, m.shaft_m, m.lever
-    p["mount"], p["rest_m"] = m.mount, m.rest_m
+    p["mount"], p["rest_m"], p["play_m"] = m.mount, m.rest_m, m.play_m
     tip_displacement(m.rest_m, m.circle_m, m.shaft_m, p["rest_tip_m"])
     p["frame"], p["gravity"] = frame, e.gravity_m_s2
     p["arm_m"] = sensors.positions_m - np.array(config.instrument.tip_mm) * 1e-3
@@ -72,5 +72,6 @@ def plant_arrays(config: EmulationConfig, unit: Unit, frame: NDArray[np.float64]
     p["magnetometer_noise_V"] = config.sensors.magnetometer_noise_uG * 1e-6
     p["daq_gain"], p["daq_offset_V"] = sensors.daq_gain, sensors.daq_offset_V
     p["daq_noise_V"] = config.sensors.daq_noise_uV * 1e-6
+    p["daq_delay_s"], p["sense_s"] = config.daq.delay_ms * 1e-3, STEP_S
     s["demand_V"], s["strap"] = config.amplifier.neutral_V, 1.0
     return plant, state

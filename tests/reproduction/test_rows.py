@@ -128,3 +128,18 @@ def test_trials_that_are_not_given_are_read(tmp_path: Path, monkeypatch: pytest.
     assert (trial.name, trial.disturbed, trial.counts.tolist()) == ("35", True, [False, True, True, False, True])
     np.testing.assert_array_equal(trial.rate, arrays["imu_gyr"])
     np.testing.assert_array_equal(trial.truth, arrays["opt_quat"])
+
+
+def test_gravity_behind_a_known_turn_is_off_by_what_the_scale_is_wrong() -> None:
+    """A quarter turn about x at 100 Hz: 2 % too large a scale turns gravity by 2 % of 90 degrees too far."""
+    n, scale = 100, 1e-4
+    angle = np.concatenate([np.zeros(200), np.pi / 2 * (np.arange(n) + 1) / n, np.full(200, np.pi / 2)])
+    force = 1e4 * np.stack([np.zeros_like(angle), np.sin(angle), np.cos(angle)], axis=1)
+    rate = np.zeros((len(angle), 3))
+    rate[200 : 200 + n, 0] = np.pi / 2 / (n / 100.0) / scale
+    rate += [30.0, -20.0, 10.0]
+    accelerometer = np.array([0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
+    for wrong in (1.0, 1.02):
+        gyroscope = np.concatenate([np.zeros(6), np.full(3, wrong * scale)])
+        off = real_sensors.gravity_after_turn_deg(gyroscope, accelerometer, force, rate)
+        assert off == pytest.approx(90.0 * (wrong - 1.0), abs=0.01)

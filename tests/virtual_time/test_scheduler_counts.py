@@ -160,6 +160,24 @@ def test_announced_one_offs_are_one_tick_and_their_gaps_add_up(bench: Bench) -> 
     assert (scheduler.snapshot().task("t").runs, scheduler.snapshot().task("t").ignored_runs) == (5, 3)
 
 
+def test_what_is_caught_up_with_before_an_announced_tick_belongs_to_it(bench: Bench) -> None:
+    scheduler = bench.scheduler(bench.task("sense", catch_up=True), bench.task("act"))
+    at(bench, scheduler, 0)
+    scheduler.ignore_next("arming")
+    bench.clock.advance_to(40 * MS)
+    scheduler.run(Ticks(3, 38, 3 * MS, MS, TimeSource.DEVICE_CLOCK))
+    at(bench, scheduler, 41)
+    snapshot = scheduler.snapshot()
+    (arming,) = snapshot.ignored
+    assert (arming.ticks, arming.caught_up, arming.skipped_ticks) == (1, 37, 2)
+    assert (snapshot.ticks, snapshot.caught_up, snapshot.skipped_ticks) == (3, 37, 2), "they are in the totals, too"
+    assert arming.worst_lateness_us == 37_000.0
+    assert snapshot.tick_lateness.n == 2, "ticks 0 and 41"
+    assert [(snapshot.task(name).runs, snapshot.task(name).ignored_runs) for name in ("sense", "act")] == [
+        (40, 38), (3, 1),
+    ]  # fmt: skip
+
+
 def test_histograms_by_name_say_when_the_worst_was(bench: Bench) -> None:
     scheduler = bench.scheduler(bench.task("t", cost_us=lambda k: 90.0 if k == 3 else 20.0), cpu_every=1)
     at(bench, scheduler, 0, 1, 2, 3, 4)

@@ -234,6 +234,8 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
             **empty,
             "per_axis": {a: dict(empty) for a in "xyz"},
             "whole_band_error": empty,
+            "bands": [],
+            "spectrum": {"hz": [], "without_um_rtHz": [], "with_um_rtHz": []},
         },
         "voluntary": {"gain": None, "delay_ms": None},
     }

@@ -46,7 +46,7 @@ def simulate_command(
     Example: micron simulate --seconds 60 --json -
     """
     from tools.closed_loop.simulate import COMMAND_DELAY_S, simulate
-    from tools.reports.run_report import headline, picture, save_picture, tremor_table
+    from tools.reports.run_report import headline, picture, save_picture, spectrum_table, tremor_table
 
     delay_s = COMMAND_DELAY_S if delay_us is None else 1e-6 * delay_us
     with clear_errors():
@@ -69,6 +69,8 @@ def simulate_command(
         outputs, people = Outputs(), console()
         with outputs.part("table"):
             people.print(tremor_table(result))
+            if result["tremor"]["spectrum"]["hz"]:
+                people.print(spectrum_table(result), "", sep="\n")
             people.print(f"commands clipped: {run.clipped}; {seconds / took_s:.0f} x real time on one core")
             people.print(headline(result), style="bold")
         with outputs.part("JSON"):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
-from firmware_py.run_request import LOOP_PRIORITY, RunRequest
+from firmware_py.run_request import LOOP_PRIORITY, WORKER_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.children import child_command, child_environment
@@ -84,7 +84,7 @@ def octaves(histogram: DurationHistogram) -> list[tuple[float, int]]:
 def settings_of(policy: Policy) -> RealtimeConfig:
     """Return the settings that the firmware asks for (``fifo``), or none."""
     if policy == "fifo":
-        return RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0)
+        return RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0, worker_priority=WORKER_PRIORITY)
     return RealtimeConfig(priority=None, lock_memory=False, timer_slack_ns=None, freeze_gc=False)
 
 

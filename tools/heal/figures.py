@@ -56,20 +56,30 @@ def is_better(before: TipError, after: TipError) -> tuple[bool, str]:
     The error in 8-12 Hz or that from 2 to 500 Hz must fall by ``LEAST_FALL`` or more, and neither the latter nor that
     below 2 Hz may rise. A band that rises although the whole does not is named.
     """
-    change = {b: after.bands[b] - before.bands[b] for b in (*BANDS, WHOLE)}
-    rises = {b: f"{b} rises by {float(np.mean(d)):.2g} um" for b, d in change.items() if _p_above_zero(d) < LEVEL}
+    change = _change(before, after)
+    rising = rises(before, after)
     for band in (SLOW, WHOLE):
-        if band in rises:
-            return False, f"the error {rises[band]}"
+        if band in rising:
+            return False, f"the error {rising[band]}"
     for band in (PURPOSE, WHOLE):
         is_worth_it = float(np.mean(-change[band])) >= LEAST_FALL * float(np.mean(before.bands[band]))
         if is_worth_it and _p_above_zero(-change[band]) < LEVEL / 2:  # one of two bands is enough
             fall = f"the error {band} falls by {float(np.mean(-change[band])):.2g} um"
-            return True, ", but ".join((fall, *rises.values()))
+            return True, ", but ".join((fall, *rising.values()))
     return False, (
         f"neither the error {PURPOSE} nor that of {WHOLE} falls by {LEAST_FALL:.0%} or more, beyond what differs "
         "between runs"
     )
+
+
+def rises(before: TipError, after: TipError) -> dict[str, str]:
+    """Return a statement for each band in which the error rises (paired t-test at ``LEVEL``), by band."""
+    change = _change(before, after)
+    return {b: f"{b} rises by {float(np.mean(d)):.2g} um" for b, d in change.items() if _p_above_zero(d) < LEVEL}
+
+
+def _change(before: TipError, after: TipError) -> dict[str, Array]:
+    return {b: after.bands[b] - before.bands[b] for b in (*BANDS, WHOLE)}
 
 
 def _p_above_zero(x: Array) -> float:

@@ -11,10 +11,12 @@ from typing import Any
 from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from sim_devices.config import emulation_config
 from tools.bench.bench_copy import with_calibration
+from tools.closed_loop.simulate import COMMAND_DELAY_S, wires_of
 from tools.errors import InputError
 from tools.heal.experiments import StackTwin, twin_of_stack
 from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
 from tools.heal.parts import PARTS, Comparison, Lab, Part
+from tools.heal.without_remedy import WITHOUT_REMEDY
 from tools.output import write_text_atomic
 
 VERIFY_FROM = 1000
@@ -34,7 +36,7 @@ Say = Callable[[str], None]
 class Step:
     """Records the treatment of a part: misfit, effects that the engine named, and if and why its remedy was kept.
 
-    ``no_remedy`` lists the named effects that the firmware cannot compensate, ``split`` those for which an experiment
+    ``no_remedy`` lists what was found that the firmware cannot compensate, ``split`` those for which an experiment
     was planned and played. ``twin`` is the corrected twin of the stack that differed most.
     """
 
@@ -81,6 +83,7 @@ def check_bench(bench: BenchFile, max_effect: int | None) -> None:
         )
     if emulation_config(bench.description.model_dump()).endoscope is not None:
         raise InputError(f"{bench.path}: an endoscope bench has no tip that is compensated; name an instrument's bench")
+    wires_of(bench, 0, COMMAND_DELAY_S)  # raises InputError for a bench whose runs cannot be simulated
 
 
 def heal(
@@ -97,6 +100,8 @@ def heal(
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
         effects = _named(compared, jobs) if name_effects else ()
+        beyond = WITHOUT_REMEDY[part.name](lab, jobs) if name_effects and part.name in WITHOUT_REMEDY else ()
+        named = effects, (*(e for e in effects if e not in STACK_EFFECTS), *beyond)
         twin: StackTwin | None = None
         if name_effects and compared.axis is not None:
             say(f"{part.name}: the twin of stack {compared.axis + 1}")
@@ -108,10 +113,10 @@ def heal(
             candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
             after = tip_error(candidate, seconds, seeds)
         except InputError as error:
-            steps.append(_step(part, compared, effects, (False, str(error)), now, twin))
+            steps.append(_step(part, compared, named, (False, str(error)), now, twin))
             continue
         kept, why = is_better(now, after)
-        steps.append(_step(part, compared, effects, (kept, why), after, twin))
+        steps.append(_step(part, compared, named, (kept, why), after, twin))
         if kept:
             bench, now = candidate, after
         else:
@@ -161,13 +166,12 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
 
 
 def _step(
-    part: Part, compared: Comparison, effects: tuple[str, ...], verdict: tuple[bool, str], after: TipError,
-    twin: StackTwin | None,
+    part: Part, compared: Comparison, named: tuple[tuple[str, ...], tuple[str, ...]], verdict: tuple[bool, str],
+    after: TipError, twin: StackTwin | None,
 ) -> Step:  # fmt: skip
-    none = tuple(e for e in effects if e not in STACK_EFFECTS)
     file = str(twin.file) if twin is not None and twin.file is not None else None
     split = twin.split if twin is not None else ()
-    return Step(part.name, compared.rms, compared.unit, effects, none, *verdict, after.mean(), file, split)
+    return Step(part.name, compared.rms, compared.unit, *named, *verdict, after.mean(), file, split)
 
 
 def lines(healed: Healed) -> list[str]:

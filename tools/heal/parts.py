@@ -147,7 +147,7 @@ def identify_stacks(lab: Lab) -> Path:
 def compare_manipulator(lab: Lab) -> Comparison:
     """Compare the tip with the firmware's geometry at a grid of voltages."""
     a = load_plan(lab.bench).stages.actuation
-    data = load_scan(_scan(lab))
+    data = load_scan(scan_tip(lab))
     rest, at, zero = np.array(a.rest_heights_m), np.empty((len(data["tip_um"]), 3)), np.empty(3)
     star_tip(rest, a.ball_circle_m, a.shaft_m, zero)
     for k, stroke in enumerate(data["stroke_um"]):
@@ -157,7 +157,8 @@ def compare_manipulator(lab: Lab) -> Comparison:
     return Comparison(float(np.sqrt(np.mean((away - away.mean(axis=0)) ** 2))), "um")
 
 
-def _scan(lab: Lab) -> Path:
+def scan_tip(lab: Lab) -> Path:
+    """Scan the tip over a grid of voltages and return the recording."""
     folder = lab.folder / "scan"
     columns, text = measure_scan(lab.config, GRID, stream(lab.config.seed, "lab.manipulator"))
     write_recording(folder, columns, text)
@@ -167,7 +168,7 @@ def _scan(lab: Lab) -> Path:
 def identify_geometry(lab: Lab) -> Path:
     """Identify the manipulator from a scan of its workspace and return the calibration file."""
     file = lab.folder / "manipulator.toml"
-    file.write_text(manipulator_calibration(identify_manipulator(load_scan(_scan(lab))), "manipulator"))
+    file.write_text(manipulator_calibration(identify_manipulator(load_scan(scan_tip(lab))), "manipulator"))
     return file
 
 

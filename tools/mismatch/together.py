@@ -31,6 +31,8 @@ def recordings_of(paths: Sequence[Path]) -> dict[str, Path]:
         else:
             matches = [path]
         for one in matches:
+            if one.is_file() and one.suffix != ".toml":
+                raise InputError(f"{one}: is not a recording; name its folder or its .toml file")
             found += [*find(one).values()] if is_folder_of_recordings(one) else [one]
     files = dict.fromkeys((p / "recording.toml" if p.is_dir() else p) for p in found)
     whole = [str(p.parent if p.name == "recording.toml" else p.with_suffix("")) for p in files]
@@ -128,7 +130,7 @@ def _check_names(recording: Recording) -> None:
 
     known = free_names(Model(make(recording)))
     for name in recording.per_recording:
-        effect, _, parameter = name.partition(".")
+        effect, dot, parameter = name.partition(".")
         if name in known:
             continue
         if effect not in EFFECTS:
@@ -138,5 +140,5 @@ def _check_names(recording: Recording) -> None:
             )
         parts = EFFECTS[effect].parts({})
         names = [p.name for p in (*parts.nonlinear, *parts.weights)]
-        if parameter and parameter not in names:
+        if dot and parameter not in names:
             raise InputError(f"--per-recording {name}: {effect} has no such parameter; it has {', '.join(names)}")

@@ -6,7 +6,7 @@ The truth is logged by the emulated world apart from anything that the firmware 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,14 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 VOLUNTARY_HZ = 1.0
 BANDS_HZ = ((0.0, 2.0), (2.0, 8.0), TREMOR_BAND_HZ, (20.0, 500.0), (2.0, 500.0))
 """Bands in which the error against the intended path is reported: what compensation adds elsewhere counts, too."""
+FOUR_BANDS_HZ = BANDS_HZ[:4]
+"""The bands that every report, table and picture of a run shows."""
+SPECTRUM_HZ = (1, 1.25, 1.6, 2, 2.5, 3.15, 4, 5, 6.3, 8, 10, 12.5, 16, 20, 25, 31.5, 40, 50, 63, 80, 100, 125, 160, 200,
+               250, 315, 400)  # fmt: skip
+"""Centres of the third octaves of a spectrum (IEC 61260)."""
+SHOWN_HZ = (1, 2, 4, 8, 10, 16, 31.5, 63, 125, 250, 400)
+"""Those of them that a table of text shows."""
+SEGMENT_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -29,10 +37,30 @@ class BandFigures:
     reduction_percent: float
 
 
+def band_name(band_hz: tuple[float, float]) -> str:
+    """Return "below 2 Hz" or "2-8 Hz"."""
+    low_hz, high_hz = band_hz
+    return f"below {high_hz:g} Hz" if low_hz <= 0.0 else f"{low_hz:g}-{high_hz:g} Hz"
+
+
+def density_text(um_rtHz: float) -> str:
+    """Return a density in five characters or less: 0.123, 12.3, 123."""
+    return f"{um_rtHz:.{3 if um_rtHz < 1.0 else 1 if um_rtHz < 100.0 else 0}f}"
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Holds amplitude densities of the tip's error as a vector, um/sqrt(Hz), in the third octaves of ``hz``."""
+
+    hz: tuple[float, ...] = ()
+    without_um_rtHz: tuple[float, ...] = ()
+    with_um_rtHz: tuple[float, ...] = ()
+
+
 @dataclass(frozen=True)
 class TremorFigures:
     """Holds the tip tremor in ``band_hz`` as a vector and per axis, and the error against the intended path in each of
-    ``bands`` and over all frequencies."""
+    ``bands``, over all frequencies, and as a spectrum."""
 
     band_hz: tuple[float, float]
     evaluated_s: tuple[float, float]
@@ -42,6 +70,7 @@ class TremorFigures:
     bands: dict[tuple[float, float], BandFigures]
     voluntary_gain: float
     voluntary_delay_ms: float
+    spectrum: Spectrum = field(default_factory=Spectrum)
 
     def to_json(self) -> dict[str, Any]:
         """The ``tremor`` and ``voluntary`` parts of the run's JSON."""
@@ -61,6 +90,7 @@ class TremorFigures:
                     }
                     for (low, high), figures in self.bands.items()
                 ],
+                "spectrum": {key: list(values) for key, values in asdict(self.spectrum).items()},
             },
             "voluntary": {"gain": self.voluntary_gain, "delay_ms": self.voluntary_delay_ms},
         }
@@ -121,7 +151,28 @@ def tremor_figures(
         bands,
         gain,
         delay_ms,
+        spectrum_of(*(e[keep] for e in centred), rate_hz=rate_hz),
     )
+
+
+def spectrum_of(without_m: Array, with_m: Array, *, rate_hz: float) -> Spectrum:
+    """Return the spectrum of two errors (n, k) in m: Welch's densities, summed over k, means over third octaves."""
+    from scipy.signal import welch
+
+    hz = [c for c in SPECTRUM_HZ if c < 0.5 * rate_hz]
+    length = min(len(without_m), round(SEGMENT_S * rate_hz))
+    densities: list[tuple[float, ...]] = []
+    for error in (without_m, with_m):
+        lines, density = welch(1e6 * error, rate_hz, nperseg=length, detrend="linear", axis=0)
+        power = np.sum(density, axis=1)
+        parts: list[float] = []
+        for centre in hz:
+            inside = (lines >= centre / 2 ** (1 / 6)) & (lines < centre * 2 ** (1 / 6))
+            if not inside.any():  # a short run has no line in a narrow one
+                inside[np.argmin(np.abs(lines - centre))] = True
+            parts.append(float(np.sqrt(np.mean(power[inside]))))
+        densities.append(tuple(parts))
+    return Spectrum(tuple(map(float, hz)), *densities)
 
 
 def _voluntary_response(rigid: Array, tip: Array, rate_hz: float, keep: NDArray[np.bool_]) -> tuple[float, float]:

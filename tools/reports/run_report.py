@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
-from tools.reports.figures import AXES, TREMOR_BAND_HZ, band_pass
+from tools.reports.figures import AXES, FOUR_BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, band_name, band_pass, density_text
 
 Array = NDArray[np.float64]
 NOTHING_UM = 0.2
@@ -67,9 +67,23 @@ def tremor_table(result: Mapping[str, Any]) -> Table:
         add(name, figures["uncompensated_rms_um"], figures["compensated_rms_um"])
     add("tremor 8-12 Hz, all axes", tremor["uncompensated_rms_um"], tremor["compensated_rms_um"])
     for band in tremor.get("bands", ()):
-        low, high = band["low_Hz"], band["high_Hz"]
-        name = f"below {high:g} Hz" if low == 0 else f"{low:g}-{high:g} Hz"
+        name = band_name((band["low_Hz"], band["high_Hz"]))
         add(f"error of path, {name}", band["without_um"], band["with_um"])
+    return table
+
+
+def spectrum_table(result: Mapping[str, Any]) -> Table:
+    """Return a table of the spectrum of the tip's error, without and with compensation, at ``SHOWN_HZ``."""
+    spectrum = result["tremor"]["spectrum"]
+    table = Table(
+        title="Spectrum of the tip's error of path, um/sqrt(Hz)", title_justify="left",
+        box=None, padding=(0, 1, 0, 0), pad_edge=False,
+    )  # fmt: skip
+    at = [n for n, hz in enumerate(spectrum["hz"]) if hz in SHOWN_HZ]
+    for column in ("Hz", *(f"{spectrum['hz'][n]:g}" for n in at)):
+        table.add_column(column, justify="left" if column == "Hz" else "right", no_wrap=True)
+    for name in ("without", "with"):
+        table.add_row(name, *(density_text(spectrum[f"{name}_um_rtHz"][n]) for n in at))
     return table
 
 
@@ -204,13 +218,15 @@ def print_report(result: Mapping[str, Any], console: Console) -> None:
     parts: list[Any] = ["", Text(headline(result), "bold"), ""]
     if result["tremor"]["reduction_percent"] is not None:
         parts.append(tremor_table(result))
+        if result["tremor"]["spectrum"]["hz"]:
+            parts += [spectrum_table(result), ""]
     parts += [task_table(result), Text(task_legend(result), "dim"), "", *summary_lines(result), ""]
     console.print(Group(*parts))
 
 
 def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
-    """Return a PNG (bytes): three axes before and after in the tremor band, the last 3 s that were scored, and the
-    spectra."""
+    """Return a PNG (bytes): three axes before and after in the tremor band, the last 3 s that were scored, the spectra,
+    and the error in four bands."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -242,7 +258,10 @@ def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
     panels[0, 0].legend(loc="upper right", ncols=2, fontsize=9)
     panels[2, 0].set_xlabel("time since scoring began (s)")
     panels[2, 1].set_xlabel("frequency (Hz)")
-    figure.suptitle(headline(result), fontsize=12)
+    bands = {(b["low_Hz"], b["high_Hz"]): (b["without_um"], b["with_um"]) for b in result["tremor"]["bands"]}
+    rows = [(band_name(band), *bands[band]) for band in FOUR_BANDS_HZ if band in bands]
+    errors = "; ".join(f"{name} {before:.2f} to {after:.2f}" for name, before, after in rows)
+    figure.suptitle(f"{headline(result)}\nError of path, um rms: {errors}", fontsize=12)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     plt.close(figure)

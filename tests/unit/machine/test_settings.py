@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from firmware_py.machine.processors import format_processors, parse_processors
 from firmware_py.machine.settings import SETTINGS, MachineState, read_machine, set_machine
 from firmware_py.machine.tree import DMA_LATENCY, Tree, hold_latency_limit, read_latency_limit_us
+from firmware_py.machine.workers import has_ordinary_workers, raise_workers
 from firmware_py.scheduler import RealtimeConfig, realtime
 from tools.cli.main import app
 from tools.diagnose.findings import setting_findings
@@ -34,6 +35,10 @@ LAB = {
     "proc/sys/kernel/sched_rt_runtime_us": "500000\n",
     "proc/sys/kernel/sched_rt_period_us": "1000000\n",
     "proc/sys/kernel/version": "#1 SMP PREEMPT_DYNAMIC Debian 6.1\n",
+    "proc/12/comm": "kworker/u8:0-events_unbound\n",
+    "proc/12/stat": "12 (kworker/u8:0-ev) I 2 0" + " 0" * 34 + " 0 0 0\n",
+    "proc/13/comm": "kworker/0:1\n",
+    "proc/self/status": "Name:\tpython\nCapEff:\t0000000000000000\n",
     f"{USB}/idVendor": "0403\n",
     f"{USB}/power/control": "auto\n",
     f"{USB}/1-2:1.0/ttyUSB0/latency_timer": "16\n",
@@ -68,6 +73,7 @@ def test_each_setting_is_read_and_judged(lab: Tree):
     found = {name: (state.describe(), state.is_good) for name, state in states(lab).items()}
     assert found == {
         "idle states": ("no limit, but a run holds it at 0 us", True),
+        "workers of ttys": ("ordinary priority", False),
         "isolated processors": ("processor 3", True),
         "processors without a tick": ("none", False),
         "interrupts": ("0-3: irq 9; 0-2: irq 30", False),
@@ -179,6 +185,68 @@ def test_a_run_reports_idle_states_as_one_of_its_settings(lab: Tree):
     (lab.root / DMA_LATENCY).unlink()
     with realtime(off, lab) as report:
         assert not report["idle_states"].done
+
+
+class Policies:
+    """Stands for the kernel's table of scheduling policies."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, table: dict[int, int]) -> None:
+        self.table = table
+        self.priorities: list[int] = []
+        monkeypatch.setattr(os, "sched_getscheduler", self.get)
+        monkeypatch.setattr(os, "sched_setscheduler", self.set)
+
+    def get(self, pid: int) -> int:
+        if pid not in self.table:
+            raise ProcessLookupError(3, "No such process")
+        return self.table[pid]
+
+    def set(self, pid: int, policy: int, param: os.sched_param) -> None:
+        self.get(pid)
+        self.table[pid] = policy
+        self.priorities.append(param.sched_priority)
+
+
+def test_workers_of_ttys_are_raised_and_those_that_were_ordinary_lowered_again(
+    lab: Tree, monkeypatch: pytest.MonkeyPatch
+):
+    for pid in (14, 15, 16):
+        (lab.root / f"proc/{pid}").mkdir()
+        (lab.root / f"proc/{pid}/comm").write_text(f"kworker/u8:{pid}\n")
+    other, fifo = os.SCHED_OTHER, os.SCHED_FIFO
+    policies = Policies(monkeypatch, {12: other, 13: other, 14: fifo, 15: other})  # the kernel has ended 16
+    undo = raise_workers(lab, 70)
+    assert policies.table == {12: fifo, 13: other, 14: fifo, 15: fifo}
+    assert policies.priorities == [70, 70]
+    del policies.table[15]
+    undo()
+    assert policies.table == {12: other, 13: other, 14: fifo}
+
+
+def test_raised_workers_are_told_from_ordinary_ones(lab: Tree):
+    stat = lab.root / "proc/12/stat"
+    assert has_ordinary_workers(lab)
+    stat.write_text(stat.read_text().replace(" 0 0 0\n", " 70 1 0\n"))
+    assert not has_ordinary_workers(lab)
+    assert states(lab)["workers of ttys"].is_good
+
+
+def test_who_may_raise_them_is_read_from_the_capabilities(lab: Tree):
+    (lab.root / "proc/self/status").write_text("CapEff:\t0000000000800000\n")
+    assert states(lab)["workers of ttys"].describe() == "ordinary priority, but a run raises it"
+
+
+def test_a_run_that_may_not_raise_them_says_so(lab: Tree, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    policies = Policies(monkeypatch, {12: os.SCHED_OTHER})
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    asked = RealtimeConfig(priority=None, lock_memory=False, timer_slack_ns=None, freeze_gc=False, worker_priority=70)
+    with realtime(asked, lab) as report:
+        assert not report["tty_workers"].done
+        assert "CAP_SYS_NICE" in report["tty_workers"].detail
+    assert policies.table == {12: os.SCHED_OTHER}
 
 
 def test_doctor_shows_and_sets_another_tree(lab: Tree):

@@ -112,9 +112,19 @@ def test_a_real_bench_is_refused_without_max_effect_and_nothing_is_written(tmp_p
         assert not (tmp_path / "out").exists()
 
 
-def test_an_unknown_bench_is_refused():
-    result = CliRunner().invoke(app, ["mismatch", "heal", "nowhere.toml"])
+@pytest.mark.parametrize(
+    ("bench", "message"),
+    [
+        ("nowhere.toml", "no such bench file"),
+        ("endoscope", "has no tip that is compensated"),
+        ("micron-can", "exactly one dac_amplifier"),
+    ],
+)
+def test_a_bench_that_cannot_be_healed_is_refused_and_nothing_is_written(tmp_path: Path, bench: str, message: str):
+    result = CliRunner().invoke(app, ["mismatch", "heal", bench, "--out", str(tmp_path / "out")])
     assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_has_no_remedy_is_said():

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from typer.testing import CliRunner
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Stage
+from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
@@ -224,6 +226,8 @@ def test_before_any_recording_a_description_without_data_is_enough(tmp_path: Pat
     [
         (Wish(), "add --amplitude"),
         (Wish(amplitude=-1.0), "--amplitude -1"),
+        (Wish(amplitude=1e9), "--amplitude 1e.09: must be a positive number below 1e9"),
+        (Wish(amplitude=1.0, centre=float("nan")), "--centre nan: must be a number"),
         (Wish(amplitude=10.0, duration_s=0.01), "--duration 0.01"),
         (Wish(amplitude=10.0, band_hz=(1.0, 900.0)), "half the sampling rate"),
         (Wish(amplitude=10.0, band_hz=(0.001, 1.0)), "no half period"),
@@ -240,6 +244,55 @@ def test_limits_outside_the_bench_are_refused():
         settle_limits(Wish(amplitude=60.0), "V", 1 / RATE_HZ, None, "x", bench)
     with pytest.raises(InputError, match="moves by at most 20000 V/s"):
         settle_limits(Wish(rate_per_s=30_000.0), "V", 1 / RATE_HZ, None, "x", bench)
+    with pytest.raises(InputError, match="--centre 120: must lie within the bench's 0 to 100 V"):
+        settle_limits(Wish(centre=120.0, amplitude=5.0), "V", 1 / RATE_HZ, None, "x", bench)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--amplitude", "60"), "leaves the bench's 0 to 100 V"),
+        (("--centre", "-5"), "--centre -5: must lie within the bench's 0 to 100 V"),
+        (("--amplitude", "10", "--rate", "1e6"), "the bench's output moves by at most"),
+    ],
+)
+def test_one_message_for_a_plan_that_the_bench_cannot_play(
+    recorded: Path, tmp_path: Path, options: tuple[str, ...], message: str
+):
+    json_file = tmp_path / "plan.json"
+    command = ["mismatch", "plan", str(recorded), "--bench", "micron", "--json", str(json_file), *options]
+    found = CliRunner().invoke(app, command)
+    assert found.exit_code == 2, found.output
+    said = " ".join(found.stderr.split())
+    assert said.count("micron: ") == 1
+    assert message in said
+    assert not found.stdout
+    assert not json_file.exists()
+
+
+def test_a_bench_is_refused_for_inputs_that_are_not_voltages(tmp_path: Path):
+    file = tmp_path / "recording.toml"
+    file.write_text(
+        """format = 1
+rate_hz = 500.0
+[twin]
+kind = "mechanical_axis"
+parameters = { inverse_mass = 2.0, damping = 1.0, stiffness = 100.0 }
+[[channels]]
+column = "f"
+role = "input"
+signal = "force"
+unit = "N"
+[[channels]]
+column = "x"
+role = "output"
+signal = "position"
+unit = "m"
+noise_rms = 1e-5
+"""
+    )
+    with pytest.raises(InputError, match="none of its inputs is in V"):
+        limits_of(open_situation(file, Asked()), Asked(bench={"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}))
 
 
 def test_a_report_of_another_twin_or_without_a_group_is_refused(recorded: Path, report: dict[str, Any]):

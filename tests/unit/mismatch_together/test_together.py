@@ -119,7 +119,17 @@ def test_one_message_for_each_wrong_command(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     assert "at least two" in refused(a, "--together")
     assert "no recording.toml" in refused(tmp_path / "empty", "--together")
+    assert "no recording.toml" in refused(a, tmp_path / "empty", "--together")
     assert "no file or folder matches" in refused(tmp_path / "none*", "--together")
+    assert "no file or folder matches" in refused(a, tmp_path / "none*", "--together")
+    assert "data.csv: is not a recording" in refused(b, tmp_path / "a" / "*", "--together")
+    assert "no such recording" in refused(a, tmp_path / "nowhere", "--together")
+    json_file = tmp_path / "report.json"
+    assert "--per-recording friction.level" in refused(
+        a, b, "--together", "--per-recording", "friction.level", "--json", json_file
+    )
+    assert not json_file.exists()
+    assert "creep has no such parameter" in refused(a, b, "--together", "--per-recording", "creep.")
     assert "--per-recording wobble" in refused(a, b, "--together", "--per-recording", "wobble")
     assert "has no such parameter" in refused(a, b, "--together", "--per-recording", "creep.wobble")
     assert "--per-recording needs --together" in refused(a, "--per-recording", "gain")

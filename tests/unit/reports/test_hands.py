@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from tools.reports.figures import BANDS_HZ, BandFigures, TremorFigures
-from tools.research.reports.hand_limits import Swing, band_rms_um, known_tremor_um, strongest
-from tools.research.reports.hands import HandRow, draw_people, markdown, people_table
+from firmware_py.frame import LAYOUT, TREMOR_AHEAD
+from tools.reports.figures import BANDS_HZ, BandFigures, Spectrum, TremorFigures
+from tools.research.reports.hand_limits import AboveBand, Swing, above_band, band_rms_um, known_tremor_um, strongest
+from tools.research.reports.hands import HANDS, METHODS, UNSEEN, HandRow, draw_people, markdown, people_table
 
 T_S = np.arange(4000) / 1000.0
 KEEP = (T_S > 1.0) & (T_S < 3.5)
@@ -76,6 +79,53 @@ def test_a_page_of_hands_that_all_reach_the_goal_explains_none() -> None:
     )
     assert "reached in 1 of 1 hands." in page
     assert "swing" not in page
+
+
+def test_the_page_has_the_spectrum_of_the_default_estimator_and_names_what_no_setting_has_seen() -> None:
+    vector = BandFigures(20.0, 4.0, 80.0)
+    spectrum = Spectrum((8.0, 10.0), (3.0, 12.0), (0.5, 1.25))
+    bands = dict.fromkeys(BANDS_HZ, vector)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, bands, 1.0, 0.0, spectrum)
+    swing = Swing(9.0, 3.0, 0.9, 74.0, 5.0)
+    rows = [HandRow("a|b", "data.npz#305:365", method, figures, 1.5, 4.0, 2.0, swing) for method in METHODS]
+    page = markdown(rows, 8.0, "x")
+    assert "| a\\|b | - | - | - | 3.0 -> 0.500 | 12.0 -> 1.2 | - |" in page
+    assert page.count("12.0 -> 1.2") == 1
+    assert "No setting was chosen on the part that is scored: a|b (305:365 s)." in page
+
+
+def test_above_the_band_a_known_tremor_within_the_strokes_leaves_the_hand_and_a_wrong_wish_adds_to_it() -> None:
+    """A hand with a line at 9 Hz and one at 40 Hz; the estimator asks for 60 Hz that is not there."""
+    t_s = np.arange(12_000) / 1000.0
+    tip = np.zeros((len(t_s), 3))
+    tip[:, 0] = 10e-6 * np.sin(2 * np.pi * 9.0 * t_s) + 1e-6 * np.sin(2 * np.pi * 40.0 * t_s)
+    truth = {"tip_rigid_m": tip, "intended_m": np.zeros_like(tip), "tip_m": 3.0 * tip}
+    frames = np.zeros((11_000, LAYOUT.size))
+    frames[:, TREMOR_AHEAD + 1] = 2e-6 * np.sin(2 * np.pi * 60.0 * t_s[1000:])
+    found = above_band(truth, frames, (t_s > 4.0) & (t_s < 11.0), np.eye(3), ActuationConfig())
+    one = 1.0 / np.sqrt(2.0)
+    assert found.hand_um == pytest.approx(one, rel=0.01)
+    assert found.known_um == pytest.approx(one, rel=0.05)
+    assert found.wish_um == pytest.approx(np.sqrt(5.0) * one, rel=0.01)
+    assert found.tip_um == pytest.approx(3.0 * one, rel=0.01)
+
+
+def test_the_page_says_what_is_added_above_the_band_and_what_room_the_strokes_leave() -> None:
+    vector = BandFigures(20.0, 4.0, 80.0)
+    bands = dict.fromkeys(BANDS_HZ, vector)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, bands, 1.0, 0.0)
+    swing = Swing(9.0, 3.0, 0.9, 74.0, 5.0)
+    rows = [
+        HandRow(name, "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, 30.0, above)
+        for name, above in (("still", AboveBand(3.0, 2.9, 3.1, 3.4)), ("wide", AboveBand(0.9, 1.5, 1.5, 4.1)))
+    ]
+    page = markdown(rows, 8.0, "x")
+    assert "| still | 3.00 | 3.40 | 1.60 | 0.00 | 2.00 | 0.78 | met |" in page
+    assert "| wide | 0.90 | 4.10 | 4.00 | 1.20 | 1.60 | 1.20 | missed |" in page
+
+
+def test_parts_that_no_setting_has_seen_are_of_hands_that_are_run() -> None:
+    assert set(UNSEEN) <= {Path(source).name for _, source in HANDS}
 
 
 def test_people_are_drawn_from_the_revision_and_summed_up_in_every_band() -> None:

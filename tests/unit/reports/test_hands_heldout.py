@@ -13,7 +13,7 @@ from hal.bench import load_bench
 from tests.conftest import DEFAULT_BENCH
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.reports.figures import BandFigures, TremorFigures
+from tools.reports.figures import FOUR_BANDS_HZ, BandFigures, TremorFigures
 from tools.research.reports import hands_heldout
 from tools.research.reports.hand_limits import Swing
 from tools.research.reports.hands import HandRow
@@ -136,7 +136,7 @@ def test_folders_without_hands_are_refused(tmp_path: Path) -> None:
 
 def row(hand: str, with_um: float, stroke_um: float) -> HandRow:
     vector = BandFigures(20.0, with_um, 100.0 * (1.0 - with_um / 20.0))
-    bands = {(20.0, 500.0): BandFigures(0.1, 2.3, -1.0)}
+    bands = {band: BandFigures(0.1 + n, 2.3 + n, -1.0) for n, band in enumerate(FOUR_BANDS_HZ)}
     figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, bands, 1.0, 0.0)
     return HandRow(hand, "-", "adaptive", figures, 1.5, stroke_um, 2.0, Swing(14.0, 3.0, 0.3, 74.0, 5.0), 30.0)
 
@@ -144,7 +144,9 @@ def row(hand: str, with_um: float, stroke_um: float) -> HandRow:
 def test_the_page_judges_hands_that_fit_and_says_what_the_stroke_leaves_of_others() -> None:
     rows = [row("good", 4.0, 0.5), row("missed", 8.0, 1.0), row("wide", 9.0, 5.0)]
     page = heldout_page(Folder(Path("hands"), (Source("good", "good", 30.0),), ("seen.npz",)), rows, 40.0, "abc")
-    assert "| good | 30 | 20.00 | 4.00 | 80.0 | 97.5 | 90.0 | yes | 0.1 -> 2.3 |" in page
+    others = "0.1 -> 2.3 | 1.1 -> 3.3 | 3.1 -> 5.3"
+    assert f"| good | 30 | 20.00 | 4.00 | 80.0 | 97.5 | 90.0 | yes | {others} |" in page
+    assert "## Spectrum of the error" in page
     assert "reached in 1 of 2." in page
     assert "Left out, because settings were chosen on them: seen.npz." in page
     assert "wide: its tremor does not fit. The stroke alone would leave 5.0 of 20.0 um (25 %)" in page

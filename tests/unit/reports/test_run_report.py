@@ -20,7 +20,8 @@ from tests.conftest import DEFAULT_BENCH
 from tools.cli.run import complete_result
 from tools.errors import OutputError
 from tools.reports import run_report
-from tools.reports.run_report import headline, summary_lines, task_table, write_report
+from tools.reports.figures import SHOWN_HZ
+from tools.reports.run_report import headline, spectrum_table, summary_lines, task_table, write_report
 
 
 @pytest.fixture(scope="module")
@@ -131,3 +132,42 @@ def test_the_page_has_every_band(sensed: dict[str, Any]) -> None:
     assert "below 2 Hz<td>40.00" in page
     assert "20-500 Hz" in page
     assert "<td>0.75" in page
+
+
+def scored() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Truth of 8 s with a tremor of 10 Hz of which a tenth is left, and the result that is made of it."""
+    t = np.arange(8000) / 1000.0
+    tremor = 20e-6 * np.sin(2 * np.pi * 10 * t)[:, None] * np.ones(3)
+    truth = {"t_ns": (t * 1e9).astype(np.int64), "tip_rigid_m": tremor, "tip_m": 0.1 * tremor}
+    truth["intended_m"] = np.zeros_like(tremor)
+    return truth, complete_result({"armed_ns": 0, "safe_ns": round(7.5e9)}, truth)
+
+
+def test_a_run_prints_its_spectrum_on_eighty_columns():
+    _, result = scored()
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(spectrum_table(result))
+    lines = console.export_text().splitlines()
+    head, without, left = (line.split() for line in lines[1:4])
+    assert head == ["Hz", *(f"{hz:g}" for hz in SHOWN_HZ)]
+    assert (without[0], left[0]) == ("without", "with")
+    at = head.index("10")
+    assert float(left[at]) == pytest.approx(0.1 * float(without[at]), rel=0.05)
+    assert max(map(float, without[1:])) == float(without[at])
+
+
+def test_the_picture_of_a_run_names_four_bands(monkeypatch: pytest.MonkeyPatch):
+    from matplotlib.figure import Figure
+
+    titles: list[str] = []
+    monkeypatch.setattr(Figure, "suptitle", lambda _, text, **__: titles.append(text))
+    truth, result = scored()
+    assert run_report.picture(truth, result).startswith(b"\x89PNG")
+    for band in ("below 2 Hz", "2-8 Hz", "8-12 Hz 24.49 to 2.45", "20-500 Hz"):
+        assert band in titles[0]
+
+
+def test_a_run_without_figures_has_the_same_keys(sensed: dict[str, Any]):
+    _, result = scored()
+    assert set(result["tremor"]) - set(sensed["tremor"]) == {"evaluated_s"}
+    assert sensed["tremor"]["bands"] == sensed["tremor"]["spectrum"]["hz"] == []

@@ -9,7 +9,7 @@ import pytest
 
 from tools.errors import InputError
 from tools.research.results.artefact import from_markdown, load, read_page, to_markdown, write_result
-from tools.research.results.page import MISSED, main, page, read_all
+from tools.research.results.page import MISSED, insert, main, page, read_all
 
 ROOT = Path(__file__).parents[3]
 FOLDER = ROOT / "docs" / "results"
@@ -41,6 +41,18 @@ def test_the_results_page_is_up_to_date():
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == made, (
         "python -m tools.research.results.page --out docs/results.md"
     )
+
+
+def test_a_head_is_written_into_its_block_alone(tmp_path: Path):
+    result = from_markdown("x", TEXT)
+    made = insert("before\n<!-- x -->\nold\n<!-- end -->\nafter\n<!-- end -->\n", result)
+    assert made.startswith("before\n<!-- x -->\nMade by")
+    assert "| a | 1.00 |" in made
+    assert "old" not in made
+    assert "A note" not in made
+    assert made.endswith("<!-- end -->\nafter\n<!-- end -->\n")
+    with pytest.raises(InputError, match="no block from '<!-- x -->'"):
+        insert("nothing", result)
 
 
 @pytest.mark.parametrize("path", ARTEFACTS, ids=lambda path: path.stem)

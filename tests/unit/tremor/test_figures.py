@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tools.reports.figures import tremor_figures
+from tools.reports.figures import SHOWN_HZ, SPECTRUM_HZ, spectrum_of, tremor_figures
 
 RATE_HZ = 1000.0
 
@@ -63,3 +63,30 @@ def test_what_comes_after_the_run_does_not_count():
     figures = tremor_figures(data, from_ns=2_000_000_000, to_ns=8_000_000_000)
     assert figures is not None
     assert figures.vector.reduction_percent == pytest.approx(75.0, abs=1.0)
+
+
+def test_the_spectrum_of_white_noise_is_flat_and_a_line_stands_where_it_is():
+    rng = np.random.default_rng(4)
+    noise = 1e-6 * rng.standard_normal((60_000, 3))
+    found = spectrum_of(noise, np.zeros_like(noise), rate_hz=RATE_HZ)
+    assert found.hz == tuple(float(hz) for hz in SPECTRUM_HZ)
+    # three axes of 1 um rms up to 500 Hz
+    assert np.median(found.without_um_rtHz) == pytest.approx(np.sqrt(3.0 / 500.0), rel=0.05)
+    assert max(found.with_um_rtHz) == 0.0
+    assert set(SHOWN_HZ) <= set(found.hz)
+    data = truth()
+    figures = tremor_figures(data, from_ns=2_000_000_000, to_ns=11_500_000_000)
+    assert figures is not None
+    spectrum = figures.spectrum
+    assert spectrum.hz[int(np.argmax(spectrum.without_um_rtHz))] == 10.0
+    at = spectrum.hz.index(10.0)
+    assert spectrum.with_um_rtHz[at] == pytest.approx(0.25 * spectrum.without_um_rtHz[at], rel=0.01)
+    octave = 10.0 * (2 ** (1 / 6) - 2 ** (-1 / 6))
+    assert spectrum.without_um_rtHz[at] == pytest.approx(np.sqrt(525 / 2 / octave), rel=0.1)
+
+
+def test_a_short_run_has_a_value_in_every_third_octave():
+    t = np.arange(1000) / RATE_HZ
+    error = 1e-6 * np.sin(2 * np.pi * 8.0 * t)[:, None]
+    found = spectrum_of(error, error, rate_hz=RATE_HZ)
+    assert all(np.isfinite(found.without_um_rtHz))

@@ -12,6 +12,8 @@ from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from tools.cli.main import app
+from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ
+from tools.research.tremor import budget
 from tools.research.tremor.bench_variant import write_variant
 from tools.research.tremor.budget import MADE, sources
 
@@ -40,3 +42,22 @@ def test_an_endoscope_has_no_budget_of_tremor() -> None:
     result = CliRunner().invoke(app, ["tremor", "budget", "--bench", str(BENCH.with_name("endoscope.toml"))])
     assert result.exit_code == 2
     assert "belongs to the instrument" in result.output
+
+
+def test_a_source_costs_what_the_error_gains_by_it_in_each_band(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Power adds up: cost^2 is the error's power with everything on less that without the source."""
+    quiet = "accelerometer noise"
+    monkeypatch.setattr(budget, "sources", lambda _: {"everything on": {}, quiet: {"emulation": budget.SOURCES[quiet]}})
+    whole, noise = budget.budget(BENCH, 8.0, lambda _: None)
+    assert [(b.low_Hz, b.high_Hz) for b in noise.bands] == list(FOUR_BANDS_HZ)
+    assert [b.cost_um for b in whole.bands] == pytest.approx([b.with_um for b in whole.bands])
+    for before, after in zip(whole.bands, noise.bands, strict=True):
+        assert after.cost_um * abs(after.cost_um) == pytest.approx(before.with_um**2 - after.with_um**2)
+    tremor = noise.bands[FOUR_BANDS_HZ.index(TREMOR_BAND_HZ)]
+    assert noise.as_dict()["cost_um"] == tremor.cost_um > 0.5
+
+
+def test_the_last_rows_keep_still_above_the_band_as_the_bench_does() -> None:
+    """The bound beside which ``ideal_changes`` is run pays nothing there; a budget of that band does."""
+    ideal = sources(BENCH)["all errors of sensors and actuators"]["firmware"]["tremor"]["adaptive"]
+    assert "quiet" not in ideal

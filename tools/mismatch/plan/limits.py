@@ -82,7 +82,9 @@ def settle_limits(
         ("--rms", wish.rms),
     ):
         if value is not None and not 0.0 < value < 1e9:
-            raise InputError(f"{option} {value:g}: must be a positive number")
+            raise InputError(f"{option} {value:g}: must be a positive number below 1e9")
+    if wish.centre is not None and not abs(wish.centre) < 1e9:
+        raise InputError(f"--centre {wish.centre:g}: must be a number between -1e9 and 1e9")
     centre, amplitude, rate, duration = wish.centre, wish.amplitude, wish.rate_per_s, wish.duration_s
     if recorded is not None:
         low, high = float(np.min(recorded)), float(np.max(recorded))
@@ -131,6 +133,10 @@ def bench_limits(file: BenchFile) -> dict[str, float]:
 
 def check_bench(centre: float, amplitude: float, rate: float, unit: str, bench: Mapping[str, float]) -> None:
     """Raise InputError for limits that the bench's output does not allow."""
+    if not bench["low"] < centre < bench["high"]:
+        raise InputError(
+            f"--centre {centre:g}: must lie within the bench's {bench['low']:g} to {bench['high']:g} {unit}"
+        )
     low, high = centre - amplitude, centre + amplitude
     if low < bench["low"] - 1e-9 or high > bench["high"] + 1e-9:
         most = min(bench["high"] - centre, centre - bench["low"])

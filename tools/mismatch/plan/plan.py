@@ -114,6 +114,8 @@ def limits_of(where: Situation, asked: Asked) -> dict[str, Limits]:
     signals = asked.inputs or tuple(rec.inputs)
     if len({rec.unit[s] for s in signals}) > 1 and (asked.wish.amplitude or asked.wish.rate_per_s or asked.wish.rms):
         raise InputError(f"{where.path}: its inputs have different units; name one with --input")
+    if asked.bench is not None and all(rec.unit[s] != "V" for s in signals):
+        raise InputError(f"{where.path}: none of its inputs is in V, and the outputs of a bench are; leave --bench out")
     out: dict[str, Limits] = {}
     for s in signals:
         wish = _in_twin_units(asked.wish, rec.file_unit[s], rec.unit[s])

@@ -36,6 +36,7 @@ def budget(
 
     Example: micron tremor budget --ideal --seconds 15
     """
+    from tools.reports.figures import FOUR_BANDS_HZ, band_name
     from tools.research.tremor.budget import budget as runs
 
     with clear_errors():
@@ -49,14 +50,16 @@ def budget(
             task = progress.add_task("starting")
             rows = list(runs(bench_path(bench), seconds, lambda text: progress.update(task, description=text)))
         if json_file != "-":
-            table = Table(title="tip tremor in 8-12 Hz, um rms (vector)", title_justify="left")
+            title = "tip tremor in 8-12 Hz, and the cost of each source in four bands, um rms (vectors)"
+            table = Table(title=title, title_justify="left")
             table.add_column("taken away")
-            for name in ("without the loop", "with it", "less (%)", "cost"):
+            costs = (f"cost {band_name(band)}" for band in FOUR_BANDS_HZ)
+            for name in ("without the loop", "with it", "less (%)", *costs):
                 table.add_column(name, justify="right")
             for row in rows:
-                figures = (row.uncompensated_rms_um, row.compensated_rms_um, row.reduction_percent, row.cost_um)
+                figures = (row.uncompensated_rms_um, row.compensated_rms_um, row.reduction_percent)
                 name = "nothing: all errors on" if row is rows[0] else row.source
-                table.add_row(name, *(f"{v:.2f}" for v in figures))
+                table.add_row(name, *(f"{v:.2f}" for v in (*figures, *(band.cost_um for band in row.bands))))
             print_whole(table)
         write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
 

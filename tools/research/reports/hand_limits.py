@@ -13,7 +13,7 @@ from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from firmware_py.tremor.adaptive_design import band
 from firmware_py.tremor.config import AdaptiveConfig
-from tools.reports.figures import TREMOR_BAND_HZ, band_pass
+from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ, band_pass
 from tools.research.tremor.cases import RATE_HZ
 from tools.research.tremor.ideal import bound_residual
 
@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 
 SWING_S = 3.0
+ABOVE_HZ = FOUR_BANDS_HZ[3]
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,13 @@ def strongest(truth: Mapping[str, Array], from_ns: int, to_ns: int) -> Swing:
     )
 
 
-def band_rms_um(x: Array, keep: NDArray[np.bool_]) -> float:
-    """``x`` (n, 3) m in 8 to 12 Hz over the rows ``keep``, as a vector, um."""
-    return float(1e6 * np.sqrt(np.mean(np.sum(band_pass(x, RATE_HZ, TREMOR_BAND_HZ)[keep] ** 2, axis=1))))
+def band_rms_um(x: Array, keep: NDArray[np.bool_], band_hz: tuple[float, float] = TREMOR_BAND_HZ) -> float:
+    """``x`` (n, 3) m in ``band_hz`` over the rows ``keep``, as a vector, um."""
+    return float(1e6 * np.sqrt(np.mean(np.sum(band_pass(x, RATE_HZ, band_hz)[keep] ** 2, axis=1))))
 
 
-def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: Array, config: ActuationConfig) -> float:
-    """um rms left in 8 to 12 Hz if the tremor were known: only the strokes and the way slow motion yields to it.
+def known_tremor(truth: Mapping[str, Array], body: Array, config: ActuationConfig) -> Array:
+    """(n, 3) m left if the tremor were known: only the strokes and the way slow motion yields to them.
 
     ``body`` (3, 3): axes of the body as columns, in the world.
     """
@@ -79,11 +80,50 @@ def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: A
     frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
     frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = whole
     frames[:, TREMOR_CORE : TREMOR_CORE + 3] = core
-    # clipped, because nothing is to be kept still above the band here
-    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3))), "overdrive": 0.0}))
+    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3)))}))
     for frame in frames:
         stage.step(frame)
-    return band_rms_um(moved + frames[:, DESIRED_TIP : DESIRED_TIP + 3], keep)
+    return moved + frames[:, DESIRED_TIP : DESIRED_TIP + 3]
+
+
+def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: Array, config: ActuationConfig) -> float:
+    """um rms left in 8 to 12 Hz if the tremor were known (``known_tremor``), with the strokes clipped.
+
+    Nothing is to be kept still above the band here, so the swing of the core is not kept within the strokes.
+    """
+    return band_rms_um(known_tremor(truth, body, config.model_copy(update={"overdrive": 0.0})), keep)
+
+
+@dataclass(frozen=True)
+class AboveBand:
+    """Motion of the tip in 20 to 500 Hz, um rms, and what carries it.
+
+    ``known_um``: with the tremor known beforehand and these strokes, which a better estimate of the same motion does
+    not lower. ``wish_um``: by the estimator, if no stroke ended and the actuators did exactly what it says.
+    """
+
+    hand_um: float
+    known_um: float
+    wish_um: float
+    tip_um: float
+
+    def added_um(self, whole_um: float) -> float:
+        """Return what is added to the hand's own motion where ``whole_um`` is left: root of the powers' difference."""
+        return float(np.sqrt(max(whole_um**2 - self.hand_um**2, 0.0)))
+
+
+def above_band(
+    truth: Mapping[str, Array], frames: Array, keep: NDArray[np.bool_], body: Array, config: ActuationConfig
+) -> AboveBand:
+    """Return the figures of a run over the rows ``keep`` of its truth.
+
+    ``frames`` (m, Layout.size) of every tick, the last of the truth's rows; ``body`` as for ``known_tremor``.
+    """
+    moved, tip = ((np.asarray(truth[key]) - np.asarray(truth["intended_m"])) @ body for key in ("tip_rigid_m", "tip_m"))
+    wish = np.zeros_like(moved)
+    wish[len(moved) - len(frames) :] = -config.gain * frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3]
+    ways = (moved, known_tremor(truth, body, config), moved + wish, tip)
+    return AboveBand(*(band_rms_um(x - x[keep].mean(axis=0), keep, ABOVE_HZ) for x in ways))
 
 
 def causal_um(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> float:

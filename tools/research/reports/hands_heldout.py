@@ -20,7 +20,17 @@ from sim_devices.config import emulation_config
 from sim_devices.plant.hand_file import HandFileError, NoHandError, load_hand
 from sim_devices.plant.recorded_hand import RecordedHand
 from tools.errors import InputError
-from tools.research.reports.hands import GOAL_PERCENT, SETTLE_S, HandRow, explain_miss, run_hand
+from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ
+from tools.research.reports.hands import (
+    GOAL_PERCENT,
+    SETTLE_S,
+    HandRow,
+    above_lines,
+    escaped,
+    explain_miss,
+    run_hand,
+    spectrum_lines,
+)
 
 LONGEST_S = 60.0
 """Of a longer recording the middle is taken, so that beginnings and ends (putting a sensor on) do not count."""
@@ -174,15 +184,15 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
         f"hand is scaled to 50 um p-p there over its middle {LONGEST_S:g} s (all of it, where it is shorter).",
         "",
         "| hand | recorded (s) | without (um rms) | with (um rms) | less (%) | the stroke alone (%) | causal (%) "
-        "| fits the stroke | 20-500 Hz, without -> with (um rms) |",
-        "|---|---:|---:|---:|---:|---:|---:|---|---|",
+        "| fits the stroke | below 2 Hz, without -> with (um rms) | 2-8 Hz | 20-500 Hz |",
+        "|---|---:|---:|---:|---:|---:|---:|---|---|---|---|",
     ]
     for row in rows:
         vector = row.figures.vector
         causal = 100.0 * (1.0 - row.causal_limit_um / vector.uncompensated_rms_um)
-        above = row.figures.bands.get((20.0, 500.0))
+        others_Hz = (band for band in FOUR_BANDS_HZ if band != TREMOR_BAND_HZ)
         cells = (
-            row.hand.replace("|", "\\|"),
+            escaped(row.hand),
             f"{row.recorded_s:.0f}",
             f"{vector.uncompensated_rms_um:.2f}",
             f"{vector.compensated_rms_um:.2f}",
@@ -190,7 +200,10 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
             f"{stroke_percent(row):.1f}",
             f"{causal:.1f}",
             "yes" if row in fits else "no",
-            "-" if above is None else f"{above.uncompensated_rms_um:.1f} -> {above.compensated_rms_um:.1f}",
+            *(
+                f"{figures.uncompensated_rms_um:.1f} -> {figures.compensated_rms_um:.1f}"
+                for figures in (row.figures.bands[band] for band in others_Hz)
+            ),
         )
         lines.append(f"| {' | '.join(cells)} |")
     lines += [
@@ -200,7 +213,10 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
         "",
         "The stroke alone: what the strokes would take away if the tremor were known beforehand. Causal: what the best",
         "causal linear filter, fitted to this very hand and with sensor noise, would take away if no stroke ended.",
+        "Other bands: error against the intended path.",
         "",
+        *above_lines(rows),
+        *spectrum_lines(rows),
     ]
     if folder.development:
         lines += [f"Left out, because settings were chosen on them: {', '.join(folder.development)}.", ""]

@@ -57,10 +57,9 @@ class Table:
     """A page of the table's own, where it has one."""
 
     def as_dict(self) -> dict[str, Any]:
-        missed = expected_misses(self.name)
+        pinned = expected_outcomes(self.name)
         rows = [
-            {**row.as_dict(), "expected": None if missed is None else key not in missed}
-            for row, key in zip(self.rows, keys(self.rows), strict=True)
+            {**row.as_dict(), "expected": pinned.get(key)} for row, key in zip(self.rows, keys(self.rows), strict=True)
         ]
         return {"format": 1, "name": self.name, "seconds": self.seconds, "rows": rows, "notes": list(self.notes)}
 
@@ -76,22 +75,24 @@ def keys(rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def expected_misses(table: str) -> set[str] | None:
-    """Keys of the rows that are expected to be missed (``expected.json``); None for a table without expectations."""
+def expected_outcomes(table: str) -> dict[str, bool]:
+    """Return the outcome that is expected of each row of a table, by its key (``expected.json``); True is met.
+
+    Empty for an unknown table.
+    """
     text = Path(__file__).with_name("expected.json").read_text(encoding="utf-8")
-    expected: dict[str, list[str]] = json.loads(text)
-    return set(expected[table]) if table in expected else None
+    expected: dict[str, dict[str, bool]] = json.loads(text)
+    return expected.get(table, {})
 
 
 def surprises(table: str, rows: Sequence[Row]) -> list[str]:
-    """Rows of ``rows`` whose outcome is not the expected one, in words. Rows that are not there surprise nobody."""
-    missed = expected_misses(table)
-    if missed is None:
-        return []
+    """Rows of ``rows`` without an expected outcome or with another one, in words. Absent rows surprise nobody."""
+    pinned = expected_outcomes(table)
     return [
-        f"{key}: {'met' if row.meets else 'missed'} ({row.ours:.4g}, published {row.published:.4g}), not expected"
+        f"{key}: {'met' if row.meets else 'missed'} ({row.ours:.4g}, published {row.published:.4g}), "
+        f"{'not expected' if key in pinned else 'not in expected.json'}"
         for row, key in zip(rows, keys(rows), strict=True)
-        if row.meets == (key in missed)
+        if row.meets is not pinned.get(key)
     ]
 
 

@@ -1,6 +1,8 @@
 """The page of all artefacts in ``docs/results``: ``python -m tools.research.results.page --out docs/results.md``.
 
-With the path of an artefact instead (``... docs/results/reliability.json``) it prints the full page of that result.
+With the path of an artefact instead (``... docs/results/reliability.json``) it prints the full page of that result;
+with ``--into PAGE`` beside it, the head of the result replaces what stands in PAGE between ``<!-- NAME -->`` and
+``<!-- end -->``.
 """
 
 from __future__ import annotations
@@ -48,6 +50,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-foreign": (),
     "mismatch-measured": (),
     "mismatch-gate": ("First run", "The same cases again"),
+    "heal": ("What was kept", "What was reverted"),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
 
@@ -63,6 +66,16 @@ def page(results: Sequence[dict[str, Any]]) -> str:
     for result in sorted(results, key=lambda r: (order.get(r["name"], len(order)), r["name"])):
         lines += _result(result)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def insert(text: str, result: dict[str, Any]) -> str:
+    """Return a page whose block of this result's name holds the head of the result. ``InputError`` without a block."""
+    begin, end = f"<!-- {result['name']} -->", "<!-- end -->"
+    head = "\n".join(_content(result["sections"][0]))
+    made, count = re.subn(rf"{begin}\n.*?{end}", lambda _: f"{begin}\n{head}{end}", text, count=1, flags=re.DOTALL)
+    if not count:
+        raise InputError(f"the page has no block from '{begin}' to '{end}'")
+    return made
 
 
 def read_all(folder: Path) -> list[dict[str, Any]]:
@@ -125,8 +138,14 @@ def main() -> int:
     parser.add_argument("artefact", type=Path, nargs="?", help="print the full page of this result")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="folder of the artefacts")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the page of all results there")
+    parser.add_argument("--into", type=Path, metavar="PAGE", help="with an artefact: write its head into this page")
     a = parser.parse_args()
     try:
+        if a.into:
+            if a.artefact is None:
+                raise InputError("--into needs the artefact whose head it writes")
+            write_text_atomic(a.into, insert(a.into.read_text(encoding="utf-8"), load(a.artefact)))
+            return 0
         text = to_markdown(load(a.artefact)) if a.artefact else page(read_all(a.folder))
         if a.out:
             write_text_atomic(a.out, text)

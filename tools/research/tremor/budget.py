@@ -1,8 +1,9 @@
 """Measures the cost of each error source at the tip: the closed loop is run with one source removed.
 
 Sources that a calibration file describes are taken away together with that file, the firmware told the part as it is:
-their cost is what calibration leaves. Costs are rms um in 8 to 12 Hz on the physical truth; cost = sqrt(with^2 -
-without^2), negative where it helps by chance. The last two rows take all away: what is left there is the estimator's.
+their cost is what calibration leaves. Costs are rms um of the tip's error against the intended path in each of four
+bands, on the physical truth; cost = sqrt(with^2 - without^2), negative where it helps by chance. The last two rows take
+all away: what is left there is the estimator's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
-from tools.reports.figures import tremor_figures
+from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ, tremor_figures
 from tools.research.tremor.bench_variant import write_variant
 from tools.research.tremor.ideal import LINE, LOOP_DELAY_S, PERFECT_EMULATION, POSITIONS_M, ideal_changes
 
@@ -57,6 +58,7 @@ MADE: dict[str, tuple[str, Changes, Changes]] = {
     ),
 }
 """The calibration file that goes, changes of [emulation] and of [firmware]."""
+ALL_ERRORS = "all errors of sensors and actuators"
 
 
 def sources(bench: Path) -> dict[str, Changes]:
@@ -67,28 +69,46 @@ def sources(bench: Path) -> dict[str, Changes]:
     for name, (stem, emulation, firmware) in MADE.items():
         kept = [file for file in files if Path(file).stem != stem]
         out[name] = {"emulation": emulation, "firmware": {"calibration": kept, **firmware}}
-    out["all errors of sensors and actuators but accelerometer noise"] = ideal_changes(noise=True)
-    out["all errors of sensors and actuators"] = ideal_changes(noise=False)
+    for name, noise in ((f"{ALL_ERRORS} but accelerometer noise", True), (ALL_ERRORS, False)):
+        out[name] = ideal_changes(noise)
+        # the estimator is the bench's own here: it keeps still above the band
+        del out[name]["firmware"]["tremor"]["adaptive"]["quiet"]
     return out
 
 
 @dataclass(frozen=True)
+class BandCost:
+    """Error against the intended path in a band, um rms, manipulator resting and working, and a source's part of it."""
+
+    low_Hz: float
+    high_Hz: float
+    without_um: float
+    with_um: float
+    cost_um: float
+
+
+@dataclass(frozen=True)
 class BudgetRow:
-    """Tip tremor with ``source`` taken away, um rms as a vector, and what it therefore costs."""
+    """Tip tremor in 8 to 12 Hz with ``source`` taken away, um rms as a vector, and what it therefore costs by band.
+
+    The first row takes nothing away: its costs are the whole error with compensation.
+    """
 
     source: str
     uncompensated_rms_um: float
     compensated_rms_um: float
     reduction_percent: float
-    cost_um: float
+    bands: tuple[BandCost, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        """JSON values; ``cost_um`` is that of the tremor band."""
+        (cost,) = (band.cost_um for band in self.bands if (band.low_Hz, band.high_Hz) == TREMOR_BAND_HZ)
+        return {**asdict(self), "cost_um": cost}
 
 
 def budget(bench: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[BudgetRow]:
     """Run the bench in virtual time for each source; the first row is the instrument as it is."""
-    whole = math.nan
+    whole: dict[tuple[float, float], float] = {}
     with tempfile.TemporaryDirectory(prefix="micron-budget-") as folder:
         for n, (source, changes) in enumerate(sources(bench).items()):
             progress(f"without {source}" if n else source)
@@ -97,10 +117,13 @@ def budget(bench: Path, seconds: float, progress: Callable[[str], None]) -> Iter
             figures = tremor_figures(run.truth, from_ns=run.armed_ns + round(SETTLE_S * 1e9), to_ns=run.safe_ns)
             if figures is None:
                 continue
-            left = figures.vector.compensated_rms_um
-            if n == 0:
-                whole = left
-            difference = whole**2 - left**2
-            cost = math.copysign(math.sqrt(abs(difference)), difference)
-            before, percent = figures.vector.uncompensated_rms_um, figures.vector.reduction_percent
-            yield BudgetRow(source, before, left, percent, cost if n else whole)
+            costs: list[BandCost] = []
+            for band in FOUR_BANDS_HZ:
+                before, left = figures.bands[band].uncompensated_rms_um, figures.bands[band].compensated_rms_um
+                difference = whole[band] ** 2 - left**2 if n else left**2
+                whole.setdefault(band, left)
+                costs.append(BandCost(*band, before, left, math.copysign(math.sqrt(abs(difference)), difference)))
+            vector = figures.vector
+            yield BudgetRow(
+                source, vector.uncompensated_rms_um, vector.compensated_rms_um, vector.reduction_percent, tuple(costs)
+            )

@@ -93,7 +93,8 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         rows: list[list[str]] = []
         for method, published in known.items():
             progress(f"{method}, {cases[0].group}")
-            rows.append(row(f"{method}, as on the instrument", left(cases, config, method, at), published))
+            name = f"{method}, {'its defaults' if method == 'adaptive' else 'as on the instrument'}"
+            rows.append(row(name, left(cases, config, method, at), published))
             if method in settings:
                 found = left(cases, tuned(config, settings[method]), method, at)
                 rows.append(row(f"{method}, tuned as there", found, published))
@@ -161,7 +162,8 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         "order).",
         "The phase of the band-pass is undone in ours; the published WFLC-FLC and BMFLC with Kalman weights are those",
         "with the phase undone. The adaptive method stands beside that page's best, the joint Kalman filter of",
-        "voluntary motion and oscillators; on the instrument it takes all of 2 to 20 Hz for what is to be cancelled,",
+        "voluntary motion and oscillators; by its defaults all of 2 to 20 Hz is to be cancelled (less by the preset of",
+        "the benches),",
         "and a third of that is this voluntary motion's tail; tuned as there, it is told that tremor lies in 5 to 16",
         "Hz. Near-zero",
         "figures of AR belong to records without noise.",

@@ -1,4 +1,4 @@
-// The tremor as the firmware sees it: path of the tip before and after, size and pace over time, spectrum, reduction.
+// The tremor as the firmware sees it: path of the tip before and after, size and pace over time, reduction; the tip's spectrum.
 import { canvas, css, digits, h, persistent, segments } from "../dom.js";
 import { bandRms, spectrum } from "../fourier.js";
 import { figure } from "../figures.js";
@@ -10,6 +10,7 @@ const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahea
 const BANDS = [[0, 2], [2, 8], [8, 12], [20, 500]];
 const SLOW = [...AXES.map((a) => `tremor_amplitude_${a}`), ...AXES.map((a) => `tremor_frequency_${a}`)];
 const UM = 1e6;
+const DECADES = 5; // of the spectrum, below its highest line
 const PATH = 700;
 const COMMANDED = 128;
 const MANUAL = 256;
@@ -25,7 +26,7 @@ export function mount(root, { link }) {
   let size = 60;
 
   const path = canvas(drawPath, "Path of the tip before and after");
-  const spectra = canvas(drawSpectrum, "Spectrum of the tremor");
+  const spectra = canvas(drawSpectrum, "Spectrum of the tip");
   const reduction = h("div.big");
   const bar = h("i", { style: "width:0" });
   const table = h("table");
@@ -46,7 +47,7 @@ export function mount(root, { link }) {
       h("h2", {}, "Tip, last 0.7 s ", h("span", { style: "color:var(--c2)" }, "before"), h("span", { style: "color:var(--accent)" }, "after"),
         h("span.grow"), segments([["xy", "x y"], ["xz", "x z"], ["yz", "y z"]], settings.plane, (v) => { settings.plane = v; settings.save(); }, "Plane")),
       h("div.chart.square", {}, path)),
-    h("section.panel.fig", {}, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div.chart", {}, spectra)),
+    h("section.panel.fig", {}, h("h2", {}, "Spectrum of the tip, 4 s ", h("small", {}, "all axes together; lines at the edges of the four bands, 8 to 12 Hz shaded")), h("div.chart", {}, spectra)),
     h("div.stack.side", {},
       h("section.panel", {}, h("h2", {}, figure("gain", "Compensation"), gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
       h("section.panel", {}, h("h2", {}, figure("bands", "Four bands, 4 s"), h("small", {}, "tip, µm rms")), bandTable),
@@ -127,25 +128,32 @@ export function mount(root, { link }) {
   let lines = null;
   function drawSpectrum(g, w, hgt) {
     if (!lines) return;
-    const [left, bottom, top, most] = [40, 20, 6, 30];
-    const peak = Math.max(1, ...lines[0].values);
-    const x = (hz) => left + ((w - left - 6) * hz) / most;
-    const y = (v) => hgt - bottom - ((hgt - bottom - top) * v) / (1.1 * peak);
+    const [left, bottom, top, least, most] = [46, 20, 6, 0.5, HZ / 2];
+    const high = Math.ceil(Math.log10(Math.max(1e-3, ...lines[0].values)));
+    const low = high - DECADES;
+    const x = (hz) => left + ((w - left - 6) * Math.log(hz / least)) / Math.log(most / least);
+    const y = (v) => top + ((hgt - bottom - top) * (high - Math.max(low, Math.log10(Math.max(v, 1e-12))))) / DECADES;
     g.font = `10px ${css("--mono")}`;
     g.fillStyle = `color-mix(in srgb, ${css("--accent")} 9%, transparent)`;
     g.fillRect(x(8), top, x(12) - x(8), hgt - bottom - top);
     g.strokeStyle = css("--grid");
     g.fillStyle = css("--faint");
-    for (let hz = 0; hz <= most; hz += 5) {
+    const edges = [...new Set(BANDS.flat())].filter((hz) => hz > least && hz < most);
+    for (const hz of edges) {
       g.beginPath(); g.moveTo(x(hz), top); g.lineTo(x(hz), hgt - bottom); g.stroke();
-      g.fillText(hz === most ? "Hz" : String(hz), x(hz) - (hz === most ? 14 : 4), hgt - 6);
+      g.fillText(String(hz), x(hz) - 5, hgt - 6);
     }
-    for (const share of [0.5, 1]) g.fillText(`${digits(peak * share, 2)} µm`, 2, y(peak * share) + 3);
+    g.fillText(`${most} Hz`, w - 44, hgt - 6);
+    for (let decade = low; decade <= high; decade++) {
+      const at = y(10 ** decade);
+      g.beginPath(); g.moveTo(left, at); g.lineTo(w - 6, at); g.stroke();
+      if (decade > low) g.fillText(decade === high ? "µm" : String(Number((10 ** decade).toPrecision(1))), 2, at + (decade === high ? 9 : 3));
+    }
     for (const { values, step, colour } of lines) {
       g.strokeStyle = colour;
-      g.lineWidth = 1.5;
+      g.lineWidth = 1.2;
       g.beginPath();
-      for (let i = 0; i * step <= most; i++) g.lineTo(x(i * step), y(values[i]));
+      for (let i = Math.ceil(least / step); i < values.length && i * step <= most; i++) g.lineTo(x(i * step), y(values[i]));
       g.stroke();
     }
   }
@@ -185,7 +193,7 @@ export function mount(root, { link }) {
   }
   const timer = setInterval(() => {
     if (!before) return;
-    lines = [powers(before, css("--c2")), powers(after, css("--accent"))];
+    lines = [powers(tip[0], css("--c2")), powers(tip[1], css("--accent"))];
     spectra.redraw();
     showBands();
     const [a, b] = [rms(before), rms(after)];

@@ -1,0 +1,41 @@
+"""What the firmware cannot compensate is named, and a healthy bench has none of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.control.plan import load_plan
+from hal.bench import load_bench
+from tests.unit.mismatch_heal.test_heal import MICRON, concealed, lab_of
+from tools.heal.heal import with_remedy
+from tools.heal.parts import identify_timing
+from tools.heal.without_remedy import name_play, name_temperature
+
+
+def test_a_healthy_bench_has_neither(tmp_path: Path):
+    lab = lab_of(MICRON, tmp_path)
+    assert name_temperature(lab) == ()
+    assert name_play(lab) == ()
+
+
+def test_a_gain_that_follows_temperature_is_named(tmp_path: Path):
+    lab = lab_of(concealed(tmp_path, "[emulation.amplifier]\ngain_per_K = 0.002"), tmp_path)
+    (named,) = name_temperature(lab)
+    assert named.startswith("gain that follows temperature (stack 1 +0.")
+    assert name_play(lab) == ()
+
+
+def test_a_loose_mount_is_named(tmp_path: Path):
+    lab = lab_of(concealed(tmp_path, "[emulation.manipulator]\nmount_play_um = 6.0"), tmp_path)
+    assert name_play(lab) == ("backlash between manipulator and tip",)
+    assert name_temperature(lab) == ()
+
+
+def test_a_delay_of_the_converter_has_a_remedy(tmp_path: Path):
+    path = concealed(tmp_path, "[emulation.daq]\ndelay_ms = 3.0\n[emulation.sensors]\nrc_spread = 0.0")
+    file = identify_timing(lab_of(path, tmp_path))
+    healed = load_plan(with_remedy(load_bench(path), file, tmp_path / "healed.toml")).stages
+    assert healed.tremor.loop_delay_s == pytest.approx(0.0047, abs=5e-5)
+    assert healed.sensing.filter_ohm * healed.sensing.filter_farad == pytest.approx(32e3 * 0.33e-6, rel=0.01)
