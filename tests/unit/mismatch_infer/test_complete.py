@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +17,11 @@ from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort
 from tools.mismatch.infer import borne_out as infer_borne_out
 from tools.mismatch.infer import diagnose
-from tools.mismatch.infer.borne_out import borne_out
+from tools.mismatch.infer.borne_out import Out, borne_out
 from tools.mismatch.infer.constants import START
 from tools.mismatch.infer.density import gain_of_events
 from tools.mismatch.infer.run import infer
-from tools.mismatch.infer.store import outputs_at_odds
+from tools.mismatch.infer.store import Scored, Store, outputs_at_odds
 from tools.mismatch.recording import Recording
 
 N = 2500
@@ -42,12 +43,17 @@ def test_a_named_delay_of_half_a_sample_is_the_hold(monkeypatch: pytest.MonkeyPa
     assert {h.how for h in late.hold.values()} == {"assumed"}
 
 
+def among(*sets: Scored) -> Callable[[Store, Sequence[Out]], list[Scored]]:
+    """Return what accepts these sets."""
+    return lambda store, gone: [s for s in sets if not any(g(s) for g in gone)]
+
+
 def test_an_effect_whose_size_may_be_zero_is_withheld(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(infer_borne_out, "broken", lambda *_: "")  # a fit to noise may be worse than no fit
     u = 40.0 * wave(np.random.default_rng(3), N)
     store = infer(stack(np.zeros(N), u), START, jobs=1, effects=[EFFECTS["first_order_lag"]]).found.store
     lag = store.with_one(store.base, places(store.problem, [EFFECTS["first_order_lag"]], ())[0])
-    left, withheld = borne_out(store, [lag, store.base])
+    left, withheld = borne_out(store, among(lag, store.base))
     assert left == [store.base]
     assert [(w.name, w.output) for w in withheld] == [("first_order_lag", "displacement")]
 
@@ -58,7 +64,7 @@ def test_an_effect_that_the_data_show_is_not_withheld() -> None:
     store = infer(stack(change, u), START, jobs=1, effects=[EFFECTS["saturation"]]).found.store
     best = store.ranked()[0]
     assert best.names == {"saturation"}
-    assert borne_out(store, [best, store.base]) == ([best, store.base], ())
+    assert borne_out(store, among(best, store.base)) == ([best, store.base], ())
 
 
 def test_outputs_that_are_down_to_the_noise_do_not_thin_the_evidence_of_another() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -18,30 +18,39 @@ from tools.mismatch.infer.store import Scored, Store
 Values = dict[str, dict[str, ParameterValue]]
 
 
-def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple[Withheld, ...]]:
-    """Return ``sets`` (best first, the last one empty) from the first supported one on, and the withheld effects.
+Out = Callable[[Scored], bool]
+"""Returns True for a set that is no candidate any more."""
 
-    A set with an effect all of whose sizes may be zero is skipped, and so is every larger set; beside fewer others the
-    same effect may be sure.
+
+def borne_out(
+    store: Store, accepted: Callable[[Store, Sequence[Out]], list[Scored]]
+) -> tuple[list[Scored], tuple[Withheld, ...]]:
+    """Return the accepted sets, best first and the last one empty, of which the first is supported, and the withheld
+    effects.
+
+    A set with an effect all of whose sizes may be zero is no candidate, and neither is a larger one; beside fewer
+    others the same effect may be sure. The set without the effect is fitted, and ranked with the others.
     """
-    left, withheld = list(sets), dict[str, Withheld]()
+    gone, withheld = list[Out](), dict[str, Withheld]()
     given = as_given(store.problem).residual
-    while left[0].placed:
+    while (left := accepted(store, gone))[0].placed:
         s = left[0]
         if broken(store.problem, given, s.fitted.theta, s.fitted.residual):
             # candidates are fitted on some of the rows
             left[0] = s = store.refined(s)
         if broken(store.problem, given, s.fitted.theta, s.fitted.residual):
-            left.pop(0)
+            gone.append(lambda other, names=s.names: other.names == names)
             continue
         unsure = uncertainty(store.problem, s.fitted)
         values = human_values(store.problem, s.fitted, unsure)
         doubts = [d for k in range(len(s.placed)) if (d := _doubt(store, s, k, values, unsure)) is not None]
         if not doubts:
             break
-        left = [other for other in left if not s.names <= other.names]
+        gone.append(lambda other, names=s.names: names <= other.names)
+        doubted = {s.placed[d.k].effect.name for d in doubts}
+        rest = store.without(s, lambda e, doubted=doubted: e.effect.name in doubted)
         for d in doubts:
-            withheld.setdefault(s.placed[d.k].effect.name, _entry(store, s, d, values, left[0].names))
+            withheld.setdefault(s.placed[d.k].effect.name, _entry(store, s, d, values, rest.names))
     return left, tuple(w for name, w in withheld.items() if name not in left[0].names)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from tools.mismatch.engine.report import Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
-from tools.mismatch.infer.borne_out import borne_out, entry_of
+from tools.mismatch.infer.borne_out import Out, borne_out, entry_of
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
 from tools.mismatch.infer.store import Scored, Store
@@ -69,26 +69,30 @@ class Answer:
     withheld: tuple[Withheld, ...] = ()
 
 
-def tested(store: Store) -> list[tuple[Scored, float]]:
-    """Return (set, the weakest test of its names), best first, down to the empty set.
+def tested(store: Store, gone: Sequence[Out]) -> list[tuple[Scored, float]]:
+    """Return (set, the weakest test of its names), best first, down to the empty set, without those that are ``gone``.
 
     A test of a name fits the set without it; that smaller set is ranked with the others. If no set has passed, the
     search goes deeper, because an unsupported name may be in all of the first sets.
     """
     out: dict[frozenset[str], tuple[Scored, float]] = {}
     passed, c = 0, store.constants
-    while len(out) < DEEPEST and (s := next((s for s in store.ranked() if s.names not in out), None)) is not None:
+
+    def ranked() -> Iterator[Scored]:
+        return (s for s in store.ranked() if not any(g(s) for g in gone))
+
+    while len(out) < DEEPEST and (s := next((s for s in ranked() if s.names not in out), None)) is not None:
         out[s.names] = s, store.least_z(s)
         passed += out[s.names][1] > c.least_z
         if not s.names or (len(out) >= TESTED and passed):
             break
-    return [out[s.names] for s in store.ranked() if s.names in out]
+    return [out[s.names] for s in ranked() if s.names in out]
 
 
-def accepted(store: Store) -> list[Scored]:
+def accepted(store: Store, gone: Sequence[Out] = ()) -> list[Scored]:
     """Return the sets of which every name passes its test, best first; at least the empty one."""
     c = store.constants
-    out = [s for s, z in tested(store) if z > c.least_z]
+    out = [s for s, z in tested(store, gone) if z > c.least_z]
     return out if any(not s.names for s in out) else [*out, store.base]
 
 
@@ -114,19 +118,25 @@ def posterior(sets: Sequence[tuple[frozenset[str], float]]) -> list[tuple[frozen
 
 def dispensable(
     names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
-) -> set[str]:
-    """Return those of ``names`` that are as likely as not to be one too many.
+) -> frozenset[str]:
+    """Return those of ``names`` that are as likely as not to be one too many, the weakest first: of two that stand for
+    each other one is needed.
 
     A name has the support of the sets that have it, or another in its place: which of two equals it is, is a question
     of its own (``Answer.rivals``).
     """
-    weights = posterior(sets)
+    weights, kept = posterior(sets), names
 
     def support(name: str) -> float:
-        rest = names - {name}
-        return sum(w for of, w in weights if name in of or (len(of - rest) == 1 and len(rest - of) == 0))
+        rest = kept - {name}
+        return sum(w for of, w in weights if name in of or (rest <= of and len(of) == len(kept)))
 
-    return {name for name in names if stated(support(name), whole, c) < LIKELY}
+    while kept:
+        weakest = min(sorted(kept), key=support)
+        if stated(support(weakest), whole, c) >= LIKELY:
+            break
+        kept -= {weakest}
+    return names - kept
 
 
 FLOOR = 1e-6
@@ -260,7 +270,7 @@ LIKELY = 0.5
 
 def decide(store: Store, first: Sequence[Trial]) -> Answer:
     """Decide on a finished search. ``first``: the candidates that were screened beside the base."""
-    good, withheld = borne_out(store, accepted(store))
+    good, withheld = borne_out(store, accepted)
     chosen = good[0]
     strange = free_curve(store.problem, store.base.fitted, candidate_signals(first))
     if strange is not None and curve_score(store, store.base, strange) > store.score(chosen):

@@ -90,6 +90,15 @@ def beside(answer: Mapping[str, Any]) -> list[str]:
     return names if len(names) == 2 else []
 
 
+def stated_names(case: Case, names: Sequence[StatedName]) -> list[StatedName]:
+    """Return the names of a case that the map of "sure" is learned on.
+
+    In a whole account the probability is that of a name among the vocabulary: no data tell a stand-in for physics
+    without a name that leaves only noise. An account that is not whole has such physics beside its names.
+    """
+    return [n for n in names if case.kind != "beside" or not n.whole]
+
+
 def vocabulary_without(name: str) -> list[Effect]:
     """Return the vocabulary without an effect and those that it is easily taken for."""
     gone = {name}.union(*(group for group in RIVALS if name in group))
@@ -116,9 +125,10 @@ def calibrate(
         return None, left
     known = [case for n, r in kept.items() for case in cases_of(n, r)]
     crossed = cross_validated(known)
-    constants = learn_sure(learn(known), [n for of in crossed.stated for n in of])
+    names = [stated_names(case, of) for case, of in zip(known, crossed.stated, strict=True)]
+    constants = learn_sure(learn(known), [n for of in names for n in of])
     corpus = CORPORA["calibrate"]
-    left_out = [p for k in range(len(crossed.stated)) for p in _left_out(constants, crossed.stated, k)]
+    left_out = [p for k in range(len(names)) for p in _left_out(constants, names, k)]
     return {
         "format": 1,
         "constants": constants.to_json(),

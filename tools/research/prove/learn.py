@@ -76,7 +76,7 @@ class SetTraits:
 def traits_of(inferred: Inferred) -> dict[str, Any]:
     """Return the figures of a search that a decision uses, as plain JSON."""
     store = inferred.found.store
-    weakest = {s.key: z for s, z in tested(store) if s.names}
+    weakest = {s.key: z for s, z in tested(store, ()) if s.names}
     ranked = store.ranked()  # tests may have fitted sets anew
     leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
     events: dict[frozenset[tuple[str, ...]], dict[str, float]] = {}
