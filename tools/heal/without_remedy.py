@@ -1,4 +1,5 @@
-"""Finds changes for which the firmware has no remedy: a gain that follows temperature, a play in the mount.
+"""Finds changes for which the firmware has no remedy: an amplifier that its monitor stops, a gain that follows
+temperature, a play in the mount.
 
 The gain is measured in a climate chamber at ``WARMER_K`` about the room's temperature. The play is what the engine
 names in the tip's record after the best geometry has been taken off.
@@ -11,8 +12,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import linregress
 
+from drivers.options import AmplifierMonitorOptions
+from drivers.specs import check_devices
 from sim_devices.config import EmulationConfig
-from sim_devices.plant.lab import drive_profile, in_place, measure_volts
+from sim_devices.plant.lab import drive_profile, in_place, measure_rest_V, measure_volts
 from sim_devices.plant.lab_tip import TIP_HZ, measure_tip
 from tools.calibrate.manipulator import NAMES, identify_manipulator, load_scan, tip_um
 from tools.heal.parts import AMPLITUDE_V, Lab, scan_tip
@@ -25,6 +28,24 @@ LOOPS_S, LOOPS_HZ = 8.0, 1000.0
 LEVEL = 1e-3
 """Level of the test of a slope against temperature, over all three stacks."""
 TIP_S = 40.0
+
+
+def name_stacks(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
+    """Name what calibrations of stacks cannot put right."""
+    return (*name_output(lab), *name_temperature(lab, jobs))
+
+
+def name_output(lab: Lab) -> tuple[str, ...]:
+    """Name each output whose voltage differs by more than the amplifier's monitor lets pass."""
+    options = check_devices(lab.bench.description, str(lab.bench.path)).values()
+    allowed_V = min((o.tolerance_V for o in options if isinstance(o, AmplifierMonitorOptions)), default=np.inf)
+    told_V = lab.config.amplifier.neutral_V
+    at_V = [measure_rest_V(lab.config, axis) for axis in range(3)]
+    return tuple(
+        f"output {axis + 1} at {volts:.2f} V where {told_V:.2f} V is told, which the monitor answers with a stop"
+        for axis, volts in enumerate(at_V)
+        if abs(volts - told_V) > allowed_V
+    )
 
 
 def name_temperature(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
@@ -76,5 +97,5 @@ def beyond_geometry(lab: Lab) -> Recording:
     return from_table(lab.folder / "tip", text, table)
 
 
-WITHOUT_REMEDY = {"stacks": name_temperature, "manipulator": name_play}
+WITHOUT_REMEDY = {"stacks": name_stacks, "manipulator": name_play}
 """Experiments by the part beside which they are made. Each returns the names of what it found."""

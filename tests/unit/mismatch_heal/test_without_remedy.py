@@ -11,13 +11,25 @@ from hal.bench import load_bench
 from tests.unit.mismatch_heal.test_heal import MICRON, concealed, lab_of
 from tools.heal.heal import with_remedy
 from tools.heal.parts import identify_timing
-from tools.heal.without_remedy import name_play, name_temperature
+from tools.heal.without_remedy import name_output, name_play, name_temperature
 
 
 def test_a_healthy_bench_has_neither(tmp_path: Path):
     lab = lab_of(MICRON, tmp_path)
+    assert name_output(lab) == ()
     assert name_temperature(lab) == ()
     assert name_play(lab) == ()
+
+
+@pytest.mark.parametrize(("ambient_C", "outputs"), [(26.0, 0), (35.0, 3)])
+def test_an_output_that_the_monitor_stops_is_named(tmp_path: Path, ambient_C: float, outputs: int):
+    """At 26 degC and 0.2 V a kelvin the output is below the monitor's 0.3 V from what was told, at 35 degC beyond."""
+    warm = (
+        f"[emulation.amplifier]\ngain_per_K = 0.004\n[emulation.environment]\nambient_C = {ambient_C}\nwarm_up_K = 0.0"
+    )
+    named = name_output(lab_of(concealed(tmp_path, warm), tmp_path))
+    assert len(named) == outputs
+    assert all("52.00 V where 50.00 V" in text for text in named)
 
 
 def test_a_gain_that_follows_temperature_is_named(tmp_path: Path):
