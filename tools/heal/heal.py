@@ -100,7 +100,7 @@ def heal(
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
         effects = _named(compared, jobs) if name_effects else ()
-        beyond = WITHOUT_REMEDY[part.name](lab, jobs) if name_effects and part.name in WITHOUT_REMEDY else ()
+        beyond = WITHOUT_REMEDY[part.name](lab) if part.name in WITHOUT_REMEDY else ()
         named = effects, (*(e for e in effects if e not in STACK_EFFECTS), *beyond)
         twin: StackTwin | None = None
         if name_effects and compared.axis is not None:

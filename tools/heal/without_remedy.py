@@ -35,9 +35,9 @@ LEAST_SHARE = 0.7
 SMOOTH_HZ = 3.0
 
 
-def name_stacks(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
+def name_stacks(lab: Lab) -> tuple[str, ...]:
     """Name what calibrations of stacks cannot put right."""
-    return (*name_output(lab), *name_temperature(lab, jobs))
+    return (*name_output(lab), *name_temperature(lab))
 
 
 def name_output(lab: Lab) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def name_output(lab: Lab) -> tuple[str, ...]:
     )
 
 
-def name_temperature(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
+def name_temperature(lab: Lab) -> tuple[str, ...]:
     """Name the stacks whose gain follows temperature, and by how much."""
     volts = drive_profile("loops", 10.0, LOOPS_S, AMPLITUDE_V, lab.config.seed)
     named: list[str] = []
@@ -76,7 +76,7 @@ def _warmer(config: EmulationConfig, kelvin: float) -> EmulationConfig:
     return config.model_copy(update={"environment": room.model_copy(update={"ambient_C": room.ambient_C + kelvin})})
 
 
-def name_play(lab: Lab, jobs: int = 1) -> tuple[str, ...]:
+def name_play(lab: Lab) -> tuple[str, ...]:
     """Name the play between manipulator and tip, along x and y of the body."""
     named = [f"{axis} {play:.1f} um" for axis, play in zip("xy", find_play(lab), strict=True) if play > 0.0]
     return (f"play between manipulator and tip ({', '.join(named)})",) if named else ()

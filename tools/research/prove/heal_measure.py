@@ -83,14 +83,16 @@ def write_bench(file: Path, seed: int, emulation: str, told: tuple[str, str] | N
     return file
 
 
-def run_one(name: str, seed: int, folder: Path, seconds: float, unchanged: TipError) -> dict[str, Any]:
+def run_one(
+    name: str, seed: int, folder: Path, seconds: float, unchanged: TipError, *, with_names: bool
+) -> dict[str, Any]:
     """Heal one bench; the tip error of the judging runs before, after and with the physics known, as a row."""
     began = time.process_time()
     change, x = CHANGES[name], size_of(name, seed)
     judges = judging(seed)
     table = change.emulation.format(x=x)
     path = write_bench(folder / "bench.toml", seed, table)
-    found = heal(path, folder, seconds=seconds, runs=8, say=lambda text: None)
+    found = heal(path, folder, seconds=seconds, runs=8, name_effects=with_names, say=lambda text: None)
     before = tip_error(load_bench(path), seconds, judges)
     after = before if found.bench is None else tip_error(load_bench(Path(found.bench)), seconds, judges)
     known = unchanged
@@ -106,6 +108,7 @@ def run_one(name: str, seed: int, folder: Path, seconds: float, unchanged: TipEr
         "seed": seed,
         "revision": revision_and_day(),
         "table": table,
+        "with_names": with_names,
         "before": before.mean(),
         "after": after.mean(),
         "known": known.mean(),
@@ -153,6 +156,8 @@ is not in it.
 - Benches with a band that is worse than before (paired t-test over the judging runs, level {LEVEL:g}):
   {"; ".join(worse) or "none"} of {len(rows)}.
 - Not run: {", ".join(missing) or "none"}.
+- The engine was not asked for names, which do not change the remedies (`--without-names`):
+  {sum(not r["with_names"] for r in rows)} of {len(rows)}.
 - CPU: {sum(r["cpu_s"] for r in rows):.0f} s.
 
 ## What was kept
@@ -172,6 +177,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, required=True, help="draws sizes, noise and hands")
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no bench after these")
+    parser.add_argument(
+        "--without-names", action="store_true", help="leave the engine out: the tip is the same, sooner"
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result there (.json or .md)")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -187,7 +195,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             bench = load_bench(write_bench(options.keep / "unchanged.toml", options.seed, ""))
             unchanged = tip_error(bench, options.seconds, judging(options.seed))
         folder = options.keep / str(options.seed) / re.sub(r"\W+", "-", name)
-        rows.append(run_one(name, options.seed, folder, options.seconds, unchanged))
+        rows.append(
+            run_one(name, options.seed, folder, options.seconds, unchanged, with_names=not options.without_names)
+        )
         with file.open("a") as out:
             out.write(json.dumps(rows[-1]) + "\n")
     if not rows:
