@@ -9,11 +9,12 @@ the unchanged bench, whose calibration was made for it: the best that a heal can
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from hal.bench import load_bench
 from tools.emulate.shipped import bench_file
 from tools.heal.figures import BANDS, LEVEL, WHOLE, TipError, rises, tip_error
 from tools.heal.heal import heal
+from tools.heal.parts import PARTS, Lab
 from tools.output import write_text_atomic
 from tools.research.prove.harness import read_rows
 from tools.research.results.artefact import write_result
@@ -92,7 +94,8 @@ def run_one(
     judges = judging(seed)
     table = change.emulation.format(x=x)
     path = write_bench(folder / "bench.toml", seed, table)
-    found = heal(path, folder, seconds=seconds, runs=8, name_effects=with_names, say=lambda text: None)
+    parts = (replace(PARTS[0], identify=lambda lab: identify_once(lab, folder.parent)), *PARTS[1:])
+    found = heal(path, folder, seconds=seconds, runs=8, name_effects=with_names, say=lambda text: None, parts=parts)
     before = tip_error(load_bench(path), seconds, judges)
     after = before if found.bench is None else tip_error(load_bench(Path(found.bench)), seconds, judges)
     known = unchanged
@@ -116,6 +119,16 @@ def run_one(
         "steps": steps,
         "cpu_s": round(time.process_time() - began, 1),
     }
+
+
+def identify_once(lab: Lab, home: Path) -> Path:
+    """Return the calibration of the lab's stacks, made once for all benches whose stacks are the same."""
+    c = lab.config
+    key = repr((c.stack, c.amplifier, c.environment, c.unit, c.seed))
+    file = home / f"stacks-{hashlib.sha256(key.encode()).hexdigest()[:16]}.toml"
+    if not file.exists():
+        write_text_atomic(file, PARTS[0].identify(lab).read_text())
+    return file
 
 
 def judging(seed: int) -> range:
