@@ -124,11 +124,12 @@ def test_a_full_ring_of_the_recorder_loses_rows_and_holds_nothing_up(tmp_path: P
         os.kill(recorders[0], signal.SIGCONT)
         return stop(recorder, *arguments)
 
+    def wrap(_bus: str, port: Any, _clock: Clock) -> Any:
+        return SocketPort(port) if hasattr(port, "drain_input") else port
+
     def go(record: Path | None) -> tuple[dict[str, Any], bytes]:
         request = RunRequest(BENCHES / "micron-e727.toml", 0.6, pace="virtual", compiled=True, record=record)
-        outcome, truth = run_in_process(
-            request, wrap=lambda _, port, __: SocketPort(port) if hasattr(port, "drain_input") else port
-        )
+        outcome, truth = run_in_process(request, wrap=wrap)
         assert truth is not None
         return outcome, b"".join(np.ascontiguousarray(truth[name]).tobytes() for name in sorted(truth))
 
