@@ -36,6 +36,8 @@ CLOCK_HZ = 60_000_000  # sample-rate dividend; rate per channel = CLOCK_HZ / (sr
 RANGE_CODES = {10.0: 0, 5.0: 1, 2.0: 2, 1.0: 3, 0.5: 4, 0.2: 5}
 SRATE_MIN, SRATE_MAX, DEC_MAX = 375, 65535, 512
 FIFO_SAMPLES = 1024
+PACKET_S = 125e-6
+"""Shortest time between two packets that is asked for: a microframe of high-speed USB."""
 BUFFER_BYTES = 1 << 18  # the device's FIFO and all that a kernel keeps of a serial line
 
 
@@ -59,9 +61,11 @@ def scan_rate(rate_hz: float) -> tuple[int, int, float]:
     return srate, dec, CLOCK_HZ / (srate * dec)
 
 
-def packet_code(bytes_per_second: float) -> int:
-    """Return the ``ps`` argument: the largest packet (16 << n bytes) that still fills within a millisecond."""
-    return max(0, min(7, int(math.log2(max(bytes_per_second / 1000.0, 16.0) / 16.0))))
+def packet_code(rate_hz: float, width: int) -> int:
+    """Return the ``ps`` argument: the largest packet (16 << n bytes) that still fills within a scan of ``width``
+    channels, so that each scan can have a tick of its own, or within ``PACKET_S`` if scans are faster."""
+    nbytes = 2 * width * max(1.0, rate_hz * PACKET_S)
+    return max(0, min(7, int(math.log2(max(nbytes, 16.0) / 16.0))))
 
 
 class Di4108:
@@ -127,7 +131,7 @@ class Di4108:
         srate, dec, rate_hz = scan_rate(config.rate_hz)
         self.stop()
         width = len(channels)
-        code = packet_code(rate_hz * 2 * width)
+        code = packet_code(rate_hz, width)
         self._command("encode 0")
         self._command(f"ps {code}")
         for i, (channel, range_V) in enumerate(zip(channels, config.range_V, strict=True)):

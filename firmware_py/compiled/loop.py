@@ -47,6 +47,8 @@ BEAT_LIMIT_MS = 100.0
 AFTER_TICK_NS = 300_000
 """The pass of the Python thread comes so long after its tick was due: the compiled thread is done with it then."""
 LONGEST_PAUSE_NS = 10_000_000
+SYNC_NS = 10_000_000
+"""Time between two looks at what the thread has counted: the period of supervision and page."""
 SWITCH_S = 0.0005
 """How long a Python thread may keep another one from running, instead of Python's 5 ms: a hand-over is not to wait."""
 
@@ -102,7 +104,7 @@ class CompiledMicron(Micron):
         self._words = np.zeros(at.N_WORDS, np.int64)
         self._words[at.SPIN_NS] = round(spin_us * 1e3)
         self._processors = os.sched_getaffinity(0)
-        self._inside_ns = 0
+        self._inside_ns = self._sync_due_ns = 0
         self._counted = self._words.copy()
         self._tasks_counted = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
         self._memory: Memory | None = None
@@ -261,7 +263,7 @@ class CompiledMicron(Micron):
             self._take_over(result)
         if self._beside_error is not None:
             raise self._beside_error
-        if self._is_virtual and result in (at.SPENT, at.GAP):
+        if self._is_virtual and result in (at.SPENT, at.GAP, at.STUCK):  # a tick may have been run
             self._pass_beside(last_k)
         return result
 
@@ -368,9 +370,10 @@ class CompiledMicron(Micron):
         Return the newest tick."""
         words, memory = self._words, self._memory
         assert memory is not None
-        words[at.BEAT_NS] = self.run.clock.now_ns()
-        if not self._is_virtual:
+        words[at.BEAT_NS] = now_ns = self.run.clock.now_ns()
+        if not self._is_virtual and now_ns >= self._sync_due_ns:
             self._sync()
+            self._sync_due_ns = now_ns + SYNC_NS
         k, due_ns = int(words[at.LAST_K]), int(words[at.LAST_DUE_NS])
         if k == last_k:
             return k

@@ -9,6 +9,7 @@ maxima.
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 from firmware_py.scheduler.background import Slack
@@ -96,6 +97,7 @@ class Scheduler:
         self._due = [self._due_at(index, self._tasks) for index in range(self._hyperperiod)]
         late = [task for task in self._tasks if task.catch_up]
         self._due_late = [self._due_at(index, late) for index in range(self._hyperperiod)]
+        self._due_beside: dict[tuple[str, ...], list[int]] = {}  # ticks of the hyperperiod, by the tasks left out
         self._waiting: list[_LiveTask] = []  # put off to the next full tick
         self._done_by_ns = round(LATEST_END * period_ns)
         self._last_scan: int | None = None  # newest tick that the catch_up tasks have seen
@@ -194,9 +196,16 @@ class Scheduler:
 
     def next_beside(self, k: int, others: Collection[str]) -> int:
         """Return the first tick after ``k`` in which ``run_beside`` has something to run."""
-        tasks = [task for task in self._tasks if task.spec.name not in others]
-        ticks = range(k + 1, k + 1 + self._hyperperiod)
-        return next((t for t in ticks if any(task.releases(t, t + 1) for task in tasks)), ticks.stop)
+        period, key = self._hyperperiod, tuple(others)
+        due = self._due_beside.get(key)
+        if due is None:
+            is_beside = [any(task.spec.name not in key for task in tasks) for tasks in self._due]
+            due = self._due_beside[key] = [index for index, is_due in enumerate(is_beside) if is_due]
+        if not due:
+            return k + 1 + period
+        begin = k + 1 - (k + 1) % period
+        at = bisect_left(due, k + 1 - begin)
+        return begin + (due[at] if at < len(due) else due[0] + period)
 
     def adopt(self, k: int, ticks: int, caught_up: int, tasks: Mapping[str, Sequence[int]]) -> None:
         """Count what a compiled loop has run since the last call, up to tick ``k``: ticks, scans that came late, and of

@@ -196,6 +196,12 @@ unit = "degC"
     return columns, descriptor
 
 
+def measure_rest_V(config: EmulationConfig, axis: int) -> float:
+    """Return what a voltmeter shows at the terminals of stack ``axis`` while its amplifier is told its neutral."""
+    unit = stack_unit(config.stack, config.unit, axis)
+    return float(drive_channel(unit, config.amplifier, STEP_S, start_temperature_C(config))[1][0]["stack_V"])
+
+
 def tumble_attitudes(positions: int) -> tuple[Array, Array]:
     """Return stage angles (n, 2) in rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity.
 

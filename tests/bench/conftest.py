@@ -17,7 +17,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +110,7 @@ class Server:
 
 
 @contextmanager
-def bench_server(more_toml: str = "", name: str = "bench") -> Iterator[Server]:
+def bench_server(more_toml: str = "", name: str = "bench", options: Sequence[str] = ()) -> Iterator[Server]:
     """``micron bench`` on ``bench`` (the default one and ``more_toml``) or ``endoscope``, in paced emulated time.
 
     Its files are in a short path, for Unix sockets.
@@ -121,7 +121,7 @@ def bench_server(more_toml: str = "", name: str = "bench") -> Iterator[Server]:
     shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)
     bench = folder / f"{name}.toml"
     command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0"]
-    command += ["--bench", str(bench)]
+    command += ["--bench", str(bench), *options]
     process = subprocess.Popen(
         [*command, "--recordings", str(recordings)],
         stdin=subprocess.DEVNULL,

@@ -300,3 +300,14 @@ def test_scans_after_host_ticks_that_began_the_run_are_numbered_on() -> None:
     assert [t.k0 for t in first] == [2, 3, 4, 5, 6]
     assert [t.source for t in first] == [TimeSource.HOST] * 3 + [TimeSource.DEVICE_CLOCK] * 2
     assert ticker.rebased == 0
+
+
+def test_the_next_tick_beside_is_the_first_in_which_a_task_that_is_not_left_out_is_due(bench: Bench) -> None:
+    scheduler = bench.scheduler(
+        bench.task("sense"), bench.task("slow", divider=10, phase=3), bench.task("rare", divider=4, phase=1)
+    )
+    for k in range(-1, 45):
+        due = [t for t in range(k + 1, k + 40) if t % 10 == 3 or t % 4 == 1]
+        assert scheduler.next_beside(k, ("sense",)) == due[0]
+        assert scheduler.next_beside(k, ("sense", "rare")) == next(t for t in due if t % 10 == 3)
+        assert scheduler.next_beside(k, ("sense", "slow", "rare")) == k + 21, "none is due in the whole hyperperiod"

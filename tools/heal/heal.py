@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,15 @@ def check_bench(bench: BenchFile, max_effect: int | None) -> None:
 
 
 def heal(
-    path: Path, out: Path, *, seconds: float, runs: int, name_effects: bool = True, jobs: int = 1, say: Say
+    path: Path,
+    out: Path,
+    *,
+    seconds: float,
+    runs: int,
+    name_effects: bool = True,
+    jobs: int = 1,
+    say: Say,
+    parts: Sequence[Part] = PARTS,
 ) -> Healed:
     """Heal the emulated bench ``path``; the healed copy and all recordings go to the folder ``out``."""
     original = load_bench(path)
@@ -95,12 +103,12 @@ def heal(
     seeds = tuple(range(VERIFY_FROM, VERIFY_FROM + runs))
     before = now = tip_error(original, seconds, seeds)
     bench, steps = original, list[Step]()
-    for part in PARTS:
+    for part in parts:
         say(f"{part.name}: measuring")
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
         effects = _named(compared, jobs) if name_effects else ()
-        beyond = WITHOUT_REMEDY[part.name](lab, jobs) if name_effects and part.name in WITHOUT_REMEDY else ()
+        beyond = WITHOUT_REMEDY[part.name](lab) if part.name in WITHOUT_REMEDY else ()
         named = effects, (*(e for e in effects if e not in STACK_EFFECTS), *beyond)
         twin: StackTwin | None = None
         if name_effects and compared.axis is not None:

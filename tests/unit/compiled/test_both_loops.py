@@ -126,6 +126,8 @@ def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
         ("e7270", FaultPlan(seed=3, corruption=0.2, from_s=0.8)),
         ("e7270", FaultPlan(silent_after_s=0.8)),
         ("e7270", FaultPlan(disconnect_after_s=0.9)),
+        ("e7270", FaultPlan(full_after_s=0.8)),
+        ("e7270", FaultPlan(full_after_s=0.8, full_for_s=0.1)),
     ],
 )
 def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
@@ -139,6 +141,7 @@ def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
         FaultPlan(seed=3, corruption=0.02, from_s=0.7),
         FaultPlan(seed=3, delay=0.05, delay_s=0.001, from_s=0.7),
         FaultPlan(delay=1.0, delay_s=0.001, from_s=0.7),  # what is put off in a tick waits for the next one
+        FaultPlan(delay=1.0, delay_s=0.5, from_s=0.9, for_s=0.001),  # one transfer blocks
         FaultPlan(silent_after_s=0.9, silent_for_s=0.1),
         FaultPlan(disconnect_after_s=0.9),
     ],

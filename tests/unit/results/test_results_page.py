@@ -43,6 +43,13 @@ def test_the_results_page_is_up_to_date():
     )
 
 
+def test_the_table_of_healed_benches_is_that_of_its_artefact():
+    text = (ROOT / "docs" / "circle.md").read_text(encoding="utf-8")
+    assert insert(text, load(FOLDER / "heal.json")) == text, (
+        "python -m tools.research.results.page docs/results/heal.json --into docs/circle.md"
+    )
+
+
 def test_a_head_is_written_into_its_block_alone(tmp_path: Path):
     result = from_markdown("x", TEXT)
     made = insert("before\n<!-- x -->\nold\n<!-- end -->\nafter\n<!-- end -->\n", result)

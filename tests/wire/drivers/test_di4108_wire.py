@@ -147,9 +147,12 @@ def test_rate_divisors(rate_hz: float, expected: tuple[int, int]):
     assert real_hz == pytest.approx(rate_hz, rel=1e-9)
 
 
-@pytest.mark.parametrize(("rate", "code"), [(16_000, 0), (6_000, 0), (32_000, 1), (320_000, 4), (1e9, 7)])
-def test_packet_fills_within_a_millisecond(rate: float, code: int):
-    assert packet_code(rate) == code
+@pytest.mark.parametrize(
+    ("rate_hz", "width", "code"),
+    [(1000.0, 8, 0), (1000.0, 3, 0), (4000.0, 8, 0), (8000.0, 8, 0), (16_000.0, 8, 1), (160_000.0, 8, 4), (1e9, 8, 7)],
+)
+def test_a_packet_fills_within_a_scan_or_125_us(rate_hz: float, width: int, code: int):
+    assert packet_code(rate_hz, width) == code
 
 
 def test_words_of_a_scan():

@@ -9,11 +9,12 @@ the unchanged bench, whose calibration was made for it: the best that a heal can
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from hal.bench import load_bench
 from tools.emulate.shipped import bench_file
 from tools.heal.figures import BANDS, LEVEL, WHOLE, TipError, rises, tip_error
 from tools.heal.heal import heal
+from tools.heal.parts import PARTS, Lab
 from tools.output import write_text_atomic
 from tools.research.prove.harness import read_rows
 from tools.research.results.artefact import write_result
@@ -83,14 +85,17 @@ def write_bench(file: Path, seed: int, emulation: str, told: tuple[str, str] | N
     return file
 
 
-def run_one(name: str, seed: int, folder: Path, seconds: float, unchanged: TipError) -> dict[str, Any]:
+def run_one(
+    name: str, seed: int, folder: Path, seconds: float, unchanged: TipError, *, with_names: bool
+) -> dict[str, Any]:
     """Heal one bench; the tip error of the judging runs before, after and with the physics known, as a row."""
     began = time.process_time()
     change, x = CHANGES[name], size_of(name, seed)
     judges = judging(seed)
     table = change.emulation.format(x=x)
     path = write_bench(folder / "bench.toml", seed, table)
-    found = heal(path, folder, seconds=seconds, runs=8, say=lambda text: None)
+    parts = (replace(PARTS[0], identify=lambda lab: identify_once(lab, folder.parent)), *PARTS[1:])
+    found = heal(path, folder, seconds=seconds, runs=8, name_effects=with_names, say=lambda text: None, parts=parts)
     before = tip_error(load_bench(path), seconds, judges)
     after = before if found.bench is None else tip_error(load_bench(Path(found.bench)), seconds, judges)
     known = unchanged
@@ -106,6 +111,7 @@ def run_one(name: str, seed: int, folder: Path, seconds: float, unchanged: TipEr
         "seed": seed,
         "revision": revision_and_day(),
         "table": table,
+        "with_names": with_names,
         "before": before.mean(),
         "after": after.mean(),
         "known": known.mean(),
@@ -113,6 +119,16 @@ def run_one(name: str, seed: int, folder: Path, seconds: float, unchanged: TipEr
         "steps": steps,
         "cpu_s": round(time.process_time() - began, 1),
     }
+
+
+def identify_once(lab: Lab, home: Path) -> Path:
+    """Return the calibration of the lab's stacks, made once for all benches whose stacks are the same."""
+    c = lab.config
+    key = repr((c.stack, c.amplifier, c.environment, c.unit, c.seed))
+    file = home / f"stacks-{hashlib.sha256(key.encode()).hexdigest()[:16]}.toml"
+    if not file.exists():
+        write_text_atomic(file, PARTS[0].identify(lab).read_text())
+    return file
 
 
 def judging(seed: int) -> range:
@@ -153,6 +169,8 @@ is not in it.
 - Benches with a band that is worse than before (paired t-test over the judging runs, level {LEVEL:g}):
   {"; ".join(worse) or "none"} of {len(rows)}.
 - Not run: {", ".join(missing) or "none"}.
+- The engine was not asked for names, which do not change the remedies (`--without-names`):
+  {sum(not r["with_names"] for r in rows)} of {len(rows)}.
 - CPU: {sum(r["cpu_s"] for r in rows):.0f} s.
 
 ## What was kept
@@ -172,6 +190,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, required=True, help="draws sizes, noise and hands")
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no bench after these")
+    parser.add_argument(
+        "--without-names", action="store_true", help="leave the engine out: the tip is the same, sooner"
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result there (.json or .md)")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -187,7 +208,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             bench = load_bench(write_bench(options.keep / "unchanged.toml", options.seed, ""))
             unchanged = tip_error(bench, options.seconds, judging(options.seed))
         folder = options.keep / str(options.seed) / re.sub(r"\W+", "-", name)
-        rows.append(run_one(name, options.seed, folder, options.seconds, unchanged))
+        rows.append(
+            run_one(name, options.seed, folder, options.seconds, unchanged, with_names=not options.without_names)
+        )
         with file.open("a") as out:
             out.write(json.dumps(rows[-1]) + "\n")
     if not rows:
