@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.infer import diagnose
+from tools.mismatch.infer.borne_out import Out
+from tools.mismatch.infer.store import Scored, Store
 from tools.mismatch.recording import Recording, Split, TwinText
 
 Array = np.ndarray
@@ -151,3 +153,8 @@ def named(made: Recording, names: Iterable[str]) -> set[str]:
     """Return the names that a diagnosis gives where these are the effects that are known."""
     report = diagnose(made, effects=[EFFECTS[n] for n in names], jobs=1)
     return {p.name for p in report.physics}
+
+
+def among(*sets: Scored) -> Callable[[Store, Sequence[Out]], list[Scored]]:
+    """Return what accepts these sets."""
+    return lambda store, gone: [s for s in sets if not any(g(s) for g in gone)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_engine.cases import RATE, named, recording, wave
+from tests.unit.mismatch_engine.cases import RATE, among, named, recording, wave
 from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.pose import prepared
@@ -46,7 +46,7 @@ def weighed(made: Recording, name: str) -> tuple[frozenset[str], tuple[Withheld,
     store = Store(problem, base, learned())
     with np.errstate(all="ignore"):
         one = store.with_one(store.base, places(problem, [EFFECTS[name]], ())[0])
-        sets, withheld = borne_out_of(store, [one, store.base])
+        sets, withheld = borne_out_of(store, among(one, store.base))
     return sets[0].names, withheld, store
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_engine.cases import recording, wave
+from tests.unit.mismatch_engine.cases import among, recording, wave
 from tests.unit.mismatch_engine.test_hold_and_one_way import axis
 from tools.mismatch.engine import pose as preparation
 from tools.mismatch.engine.report import Hold, Report
@@ -17,11 +16,11 @@ from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort
 from tools.mismatch.infer import borne_out as infer_borne_out
 from tools.mismatch.infer import diagnose
-from tools.mismatch.infer.borne_out import Out, borne_out
+from tools.mismatch.infer.borne_out import borne_out
 from tools.mismatch.infer.constants import START
 from tools.mismatch.infer.density import gain_of_events
 from tools.mismatch.infer.run import infer
-from tools.mismatch.infer.store import Scored, Store, outputs_at_odds
+from tools.mismatch.infer.store import outputs_at_odds
 from tools.mismatch.recording import Recording
 
 N = 2500
@@ -41,11 +40,6 @@ def test_a_named_delay_of_half_a_sample_is_the_hold(monkeypatch: pytest.MonkeyPa
     late = diagnose(axis(5, zero=False, late=3.0), jobs=1, effects=[EFFECTS["dead_time"]])
     assert [p.name for p in late.physics] == ["dead_time"]
     assert {h.how for h in late.hold.values()} == {"assumed"}
-
-
-def among(*sets: Scored) -> Callable[[Store, Sequence[Out]], list[Scored]]:
-    """Return what accepts these sets."""
-    return lambda store, gone: [s for s in sets if not any(g(s) for g in gone)]
 
 
 def test_an_effect_whose_size_may_be_zero_is_withheld(monkeypatch: pytest.MonkeyPatch) -> None:
