@@ -109,7 +109,7 @@ def test_a_name_that_may_be_one_too_many_is_told_from_one_of_two_equals() -> Non
     assert dispensable(frozenset("ab"), extra, False, c) == {"b"}
     assert dispensable(frozenset("ab"), equals, False, c) == set()
     assert dispensable(frozenset("ab"), extra, True, c) == {"b"}
-    assert dispensable(frozenset("ab"), [(of, v - 2.0 * (of != frozenset("ab"))) for of, v in extra], True, c) == set()
+    assert dispensable(frozenset("ab"), [(of, v - 4.0 * (of != frozenset("ab"))) for of, v in extra], True, c) == set()
     either = [(frozenset("ab"), 0.0), (frozenset("a"), -0.2), (frozenset("b"), -0.3), (frozenset(), -60.0)]
     assert dispensable(frozenset("ab"), either, False, c) == {"b"}
 
