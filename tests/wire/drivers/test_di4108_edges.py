@@ -27,14 +27,14 @@ def test_the_inputs_are_told_with_range_and_resolution():
 
 
 def test_fast_scans_come_in_larger_packets():
-    """8 inputs at 7.5 kHz are 120 bytes in a millisecond: packets of 64, ``ps 2``; half of one is not believed."""
-    script = [(kind, data.replace(b"ps 0", b"ps 2").replace(b"srate 60000", b"srate 8000")) for kind, data in CONFIGURE]
+    """8 inputs at 16 kHz are 16 bytes in 62.5 us: packets of 32, ``ps 1``; half of one is not believed."""
+    script = [(kind, data.replace(b"ps 0", b"ps 1").replace(b"srate 60000", b"srate 3750")) for kind, data in CONFIGURE]
     stream = b"".join(alike(k) for k in range(16))
-    pieces = [e for i in range(0, 256, 32) for e in (("at", 10 * MS + i * 8_333), ("r", stream[i : i + 32]))]
+    pieces = [e for i in range(0, 256, 16) for e in (("at", 10 * MS + i * 3_906), ("r", stream[i : i + 16]))]
     daq, port, _ = device(*script, ("w", b"start 0\r"), *pieces)
-    assert daq.configure(ScanConfig(7500.0, tuple(range(8)), (5.0,) * 8)).rate_hz == 7500.0
+    assert daq.configure(ScanConfig(16000.0, tuple(range(8)), (5.0,) * 8)).rate_hz == 16000.0
     daq.start()
-    assert [daq.read_scans(OUT, 0.01).n for _ in range(4)] == [4] * 4
+    assert [daq.read_scans(OUT, 0.01).n for _ in range(8)] == [2] * 8
     port.done()
 
 
