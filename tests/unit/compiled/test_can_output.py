@@ -48,7 +48,7 @@ class Stand:
         self.hub, self.node, self.t_ns = CanHub(500_000), CanPiezoNode(), 0
         self.hub.attach(self.node)
         self.server = CanSocketServer(self.hub, folder / "can.sock")
-        clock = MonotonicClock()
+        self.clock = clock = MonotonicClock()
         self.bus = UnixCan(str(folder / "can.sock"), clock)
         self.driver = CanAmplifier(self.bus, clock)
         self.side = CanSide(self.driver, clock)
@@ -71,6 +71,8 @@ class Stand:
             self.t_ns += MS
             self.now_ns += MS
             self.hub.advance_to(self.t_ns)
+            # frames are stamped by the real clock, which must not be behind the time that the test has moved
+            self.clock.sleep_until_ns(int(self.now_ns[0]))
 
     def write(self, *volts: float) -> int:
         return write(self.memory, self.side.fileno(), np.array(volts))[0]

@@ -1,4 +1,4 @@
-"""What the firmware cannot compensate is named, and a healthy bench has none of it."""
+"""Heal names what the firmware cannot compensate, and finds none of it on a healthy bench."""
 
 from __future__ import annotations
 

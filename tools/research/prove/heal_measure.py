@@ -173,11 +173,11 @@ is not in it.
   {sum(not r["with_names"] for r in rows)} of {len(rows)}.
 - CPU: {sum(r["cpu_s"] for r in rows):.0f} s.
 
-## What was kept
+## Kept remedies
 
 {chr(10).join(f"- {k}" for k in kept) or "- nothing"}
 
-## What was reverted
+## Reverted remedies
 
 {chr(10).join(f"- {k}" for k in reverted) or "- nothing"}
 """

@@ -50,7 +50,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-foreign": (),
     "mismatch-measured": (),
     "mismatch-gate": ("First run", "The same cases again"),
-    "heal": ("What was kept", "What was reverted"),
+    "heal": ("Kept remedies", "Reverted remedies"),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
 
