@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ class EquationError(ValueError):
     """Is raised for an equation that cannot be used. The message names the equation and the cause."""
 
 
-@dataclass(frozen=True)
-class Program:
+class Program(NamedTuple):
     """``operations`` (k, 5): code, result, three arguments, all registers. ``registers``: their first values, constants
     in place; the variables come first, in the order given. ``results``: registers of the results.
     """

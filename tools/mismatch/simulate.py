@@ -14,13 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.physics.effect import (
-    STAGES,
-    Array,
-    Context,
-    Human,
-    Settings,
-)
+from sim_devices.physics.effect import STAGES, Array, Context, Human, Settings
 from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
@@ -44,6 +38,17 @@ class Design:
     columns: Mapping[str, Array]
     linear: Mapping[str, tuple[int, ...]]
     penalty: Array
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Says how a pass through the chain is made: at which ``theta``, and what stays a column."""
+
+    theta: Array
+    join: bool
+    """True if weights are multiplied with their columns where the columns arise."""
+    folded: set[int] | None = None
+    """Collects the parameters whose columns cannot stay linear; None if nobody asks."""
 
 
 class Model:
@@ -202,7 +207,7 @@ class Model:
 
         ``only`` restricts the outputs (None: all).
         """
-        flow = self._flow(view_run(self.twin, view), theta, True, only=only)
+        flow = self._flow(view_run(self.twin, view), Pass(theta, True), only=only)
         return {o: view.take(s.value) for o, s in flow.items()}
 
     def whole(self, view: View, theta: Array) -> dict[str, Array]:
@@ -210,7 +215,7 @@ class Model:
         key = ("whole", self.key, theta.tobytes())
 
         def make() -> Array:
-            flow = self._flow(view_run(self.twin, view), theta, True)
+            flow = self._flow(view_run(self.twin, view), Pass(theta, True))
             return np.stack([flow[o].value for o in self.twin.outputs])
 
         return dict(zip(self.twin.outputs, remember(view.memo, key, make), strict=True))
@@ -234,7 +239,7 @@ class Model:
 
         ``only`` restricts the outputs; ``samples`` of the recording replace the whole view.
         """
-        flow = self._flow(view_run(self.twin, view), theta, False, only=only)
+        flow = self._flow(view_run(self.twin, view), Pass(theta, False), only=only)
         keep = set(self.linear)
         constant: dict[str, Array] = {}
         columns: dict[str, Array] = {}
@@ -286,42 +291,40 @@ class Model:
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
         """Return the outputs for given inputs and further forces, with this model as the base physics of another."""
-        return self._flow(run, theta, join, None, inputs, forces)
+        return self._flow(run, Pass(theta, join), inputs, forces)
 
     def _flow(
         self,
         run: Run,
-        theta: Array,
-        join: bool,
-        folded: set[int] | None = None,
+        how: Pass,
         given: Mapping[str, Signal] | None = None,
         beside: Sequence[Force] = (),
         only: Collection[str] | None = None,
     ) -> dict[str, Signal]:
-        theta = np.asarray(theta, np.float64)
-        inputs, forces = self._driven(run, theta, join, folded, given)
+        how = replace(how, theta=np.asarray(how.theta, np.float64))
+        theta, folded = how.theta, how.folded
+        inputs, forces = self._driven(run, how, given)
         if folded is not None and forces:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
         every = [*forces, *beside]
         run = replace(run, bent=self.bends)
-        outputs = self.twin.respond(run, inputs, theta, every, join)
+        outputs = self.twin.respond(run, inputs, theta, every, how.join)
         if only is not None:
             outputs = {o: s for o, s in outputs.items() if o in only}
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
-        found, behind = self._behind(run, inputs, outputs, theta, join, folded)
+        found, behind = self._behind(run, inputs, outputs, how)
         recorded = run
         for _ in range(START_PASSES if run.window and behind else 0):
             run = before_effects(recorded, behind)
-            outputs = self.twin.respond(run, inputs, theta, every, join)
-            found, behind = self._behind(run, inputs, {o: outputs[o] for o in found}, theta, join, folded)
+            outputs = self.twin.respond(run, inputs, theta, every, how.join)
+            found, behind = self._behind(run, inputs, {o: outputs[o] for o in found}, how)
         return found
 
     def _behind(
-        self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], theta: Array, join: bool,
-        folded: set[int] | None,
-    ) -> tuple[dict[str, Signal], dict[str, Array]]:  # fmt: skip
+        self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], how: Pass
+    ) -> tuple[dict[str, Signal], dict[str, Array]]:
         """Return the outputs behind their effects, and the contributions (n,) of effects driven by an output.
 
         The contributions are needed where states restart from outputs that were measured behind these effects.
@@ -339,18 +342,18 @@ class Model:
                 drive = self.twin.drive(o)
                 by = inputs[drive] if self.twin.static and drive else None
                 was = found[o]
-                now = self._pass(run, k, was, by, o, theta, join, folded)
+                now = self._pass(run, k, was, by, o, how)
                 if afresh and pl.effect.driven:
                     # the start states depend on its weights
-                    if folded is not None:
-                        folded.update(now.columns)
-                    now = fold(now, theta)
-                    change[o] = change.get(o, 0.0) + now.value - fold(was, theta).value
+                    if how.folded is not None:
+                        how.folded.update(now.columns)
+                    now = fold(now, how.theta)
+                    change[o] = change.get(o, 0.0) + now.value - fold(was, how.theta).value
                 found[o] = now
         return found, change
 
     def _driven(
-        self, run: Run, theta: Array, join: bool, folded: set[int] | None, given: Mapping[str, Signal] | None = None
+        self, run: Run, how: Pass, given: Mapping[str, Signal] | None = None
     ) -> tuple[dict[str, Signal], list[Force]]:
         """Return the excitation of the base physics: inputs behind their effects, and forces."""
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
@@ -358,21 +361,22 @@ class Model:
             pl = self.placed[k]
             if pl.site == "input":
                 if pl.target == BETWEEN and BETWEEN not in inputs and isinstance(self.twin, CascadeTwin):
-                    inputs[BETWEEN] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)
-                inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
-        return inputs, [self.force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
+                    inputs[BETWEEN] = self.twin.between(run, inputs[self.twin.inputs[0]], how.theta)
+                inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], how)
+        return inputs, [self.force(k, how.theta) for k in self.order if self.placed[k].site == "feedback"]
 
     def start_states(self, view: View, theta: Array) -> Array:
         """Return the states (s,) at the first sample of a free run of differential equations."""
         inside = inside_of(self.twin)
         assert inside is not None
         run = view_run(self.twin, view)
-        inputs, forces = self._driven(run, theta, True, None)
+        how = Pass(theta, True)
+        inputs, forces = self._driven(run, how)
         used = {s: fold(x, theta) for s, x in inputs.items()}
         recorded = run
         for _ in range(START_PASSES if run.window else 0):
             outputs = self.twin.respond(run, inputs, theta, forces, True)
-            behind = self._behind(run, inputs, outputs, theta, True, None)[1]
+            behind = self._behind(run, inputs, outputs, how)[1]
             if not behind:
                 break
             run = before_effects(recorded, behind)
@@ -384,17 +388,8 @@ class Model:
         a, b = self._slices[k]
         return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)
 
-    def _pass(
-        self,
-        run: Run,
-        k: int,
-        x: Signal,
-        by: Signal | None,
-        output: str,
-        theta: Array,
-        join: bool,
-        folded: set[int] | None,
-    ) -> Signal:
+    def _pass(self, run: Run, k: int, x: Signal, by: Signal | None, output: str, how: Pass) -> Signal:
+        theta = how.theta
         pl, effect = self.placed[k], self.placed[k].effect
         a, b = self._slices[k]
         q = theta[a]
@@ -404,8 +399,8 @@ class Model:
         gain = self.twin.input_gain(pl.target, theta) if pl.site == "input" else 1.0
 
         def collapse(s: Signal) -> Signal:
-            if folded is not None:
-                folded.update(s.columns)
+            if how.folded is not None:
+                how.folded.update(s.columns)
             return fold(s, theta, gain)
 
         if effect.kind == "linear":
@@ -427,7 +422,7 @@ class Model:
         else:
             s = Signal(x.value, {}, ("undriven",))
         columns = remember(run.memo, (key, s.token), lambda: np.asfortranarray(basis(s.value, ctx, q, pl.settings)))
-        if join and pl.site == "output":
+        if how.join and pl.site == "output":
             return Signal(x.value + columns @ theta[b], x.columns, (*x.token, key, theta[b].tobytes()))
         return x.plus({b.start + i: columns[:, i] for i in range(columns.shape[1])}, key)
 
@@ -437,20 +432,12 @@ class Model:
         t = np.asarray(np.arange(n) * 1e-2, np.float64)
         wave: Array = np.sin(2 * np.pi * t / t[-1])
         names = {*self.twin.inputs, *(s for pl in self.placed for s in pl.effect.needs)}
-        run = Run(
-            t,
-            1e-2,
-            dict.fromkeys(names, wave),
-            self.twin.inputs,
-            dict.fromkeys(self.twin.outputs, wave),
-            (0,),
-            0,
-            {},
-        )
+        outputs = dict.fromkeys(self.twin.outputs, wave)
+        run = Run(t, 1e-2, dict.fromkeys(names, wave), self.twin.inputs, outputs, (0,), 0, {})
         theta = np.array([middle(f) for f in self._free])
         folded: set[int] = set()
         with np.errstate(all="ignore"):
-            flow = self._flow(run, theta, False, folded)
+            flow = self._flow(run, Pass(theta, False, folded))
         found = {j for s in flow.values() for j in s.columns}
         return found - folded
 
@@ -466,18 +453,8 @@ def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
     """Return the context of an effect on this run."""
-    return Context(
-        run.t,
-        run.dt,
-        run.signals,
-        target,
-        output,
-        twin.drive(output),
-        run.afresh,
-        None,
-        None,
-        twin.facts(output),
-    )
+    drive, facts = twin.drive(output), twin.facts(output)
+    return Context(run.t, run.dt, run.signals, target, output, drive, run.afresh, None, None, facts)
 
 
 def _frozen(settings: Settings) -> tuple[object, ...]:

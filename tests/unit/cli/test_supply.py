@@ -4,27 +4,34 @@ from __future__ import annotations
 
 import re
 from email.message import Message
-from types import SimpleNamespace
-from typing import Any, cast
+from importlib.metadata import Distribution
+from typing import Any
 
 from tools.research.supply.audit import CONSTRAINTS, audited, findings, verdict
 from tools.research.supply.licences import PYPROJECT, declared, page, parts
 
 
-def package(name: str, **fields: str) -> Any:
-    meta = Message()
-    meta["Name"] = name
-    for key, value in fields.items():
-        meta[key.replace("_", "-")] = value
-    return cast(Any, SimpleNamespace(metadata=meta, version="1.0", files=[]))
+class Package(Distribution):
+    """An installed distribution that consists of its metadata."""
+
+    def __init__(self, name: str, **fields: str) -> None:
+        self._meta = Message()
+        for key, value in {"Name": name, "Version": "1.0", **fields}.items():
+            self._meta[key.replace("_", "-")] = value
+
+    def read_text(self, filename: str) -> str | None:
+        return str(self._meta) if filename == "METADATA" else None
+
+    def locate_file(self, path: Any) -> Any:
+        raise FileNotFoundError(path)
 
 
 def test_a_copyleft_part_is_named_and_where_it_is_used():
     found = [
-        package("python-can", License_Expression="LGPL-3.0-only"),
-        package("numpy", License="BSD-3-Clause\nlong text"),
-        package("silent"),
-        package("micron-bench", License_Expression="Apache-2.0"),
+        Package("python-can", License_Expression="LGPL-3.0-only"),
+        Package("numpy", License="BSD-3-Clause\nlong text"),
+        Package("silent"),
+        Package("micron-bench", License_Expression="Apache-2.0"),
     ]
     rows = parts(found, {"python-can": "", "numpy": ""})
     assert [(p.name, p.licence, p.direct) for p in rows] == [

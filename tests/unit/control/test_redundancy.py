@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.control.parity import ALONE_TICKS, LEARN_TICKS, PATIENCE_TICKS
+from firmware_py.control.plan import load_plan
+from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
 from firmware_py.control.redundancy import Redundancy
-from firmware_py.frame import LAYOUT, PARITIES, PARITY, STATUS, FrameStatus
+from firmware_py.control.stages import StageConfigs, Stages
+from firmware_py.frame import PARITIES, PARITY, STATUS, FrameStatus
 from firmware_py.run.safety import State
+from firmware_py.sensing.config import SensingConfig
+from hal.bench import load_bench
 from tests.unit.control.stand import StandRun
 
-# eight directions in the plane of two parities, 22.5 degrees apart
-TURN = np.pi * np.arange(8) / 8
-NULL = np.array([np.cos(TURN), np.sin(TURN)])
-SIZE = max(column.start + column.size for column in LAYOUT)
+EIGHT = load_plan(load_bench(Path(__file__).parents[3] / "benches" / "micron-eight.toml")).stages
+NULL = Stages(EIGHT).sensing.params["null"][0].copy()
+NULL /= np.linalg.norm(NULL, axis=0)
+"""Direction of each axis in the plane of two parities."""
+BETWEEN = (NULL[:, 3] + NULL[:, 5]) / 2.0
+"""As near to axis 3 as to axis 5, and within 6 degrees of both."""
 
 
 class Bench:
     """A redundancy of ``axes`` axes in the state ``state``; ``told`` is what the stage's parity would be."""
 
     def __init__(self, axes: int = 8, state: State = State.RUNNING) -> None:
-        self.left_out: list[int] = []
-        self.ignored: list[int] = []
         run = StandRun(state)
         self.supervisor, self.counts = run.supervisor, run.counts
-        self.check = SimpleNamespace(ignore=self.ignored.append, stepped_together=False)
-        params = {"parities": np.array([axes - 6]), "null": np.array([NULL[:, :axes]])}
-        self.sensing = SimpleNamespace(
-            params=params, config=SimpleNamespace(channels=tuple(range(axes))), leave_out=self._leave_out
-        )
-        self.frame = np.zeros(SIZE)
-        self.redundancy = Redundancy(
-            cast(Any, SimpleNamespace(sensing=self.sensing, frame=self.frame)),
-            cast(Any, self.check),
-            run,
-            tuple(f"acc{i}" for i in range(axes)),
-        )
+        self.stages = Stages(EIGHT if axes == 8 else StageConfigs(SensingConfig(), EIGHT.tremor, EIGHT.actuation))
+        labels = tuple(f"acc{i}" for i in range(axes))
+        self.check = ScanCheck(PlausibilityLimits(), 5.0 / 32768, range(axes), labels, sensors=axes)
+        self.frame = self.stages.frame
+        self.redundancy = Redundancy(self.stages, self.check, run, labels)
 
-    def _leave_out(self, axis: int, usual: Any) -> float:
-        self.left_out.append(axis)
-        self.sensing.params["parities"][0] -= 1
-        self.sensing.params["null"][0, 1] = 0.0
-        return 1.25
+    @property
+    def left_out(self) -> list[int]:
+        """The axes that sensing solves without: their columns of the solution are zero."""
+        solve = self.stages.sensing.params["kinematics"]["solve"][0]
+        return np.flatnonzero(~np.any(solve, axis=0)).tolist()
 
     def agree(self, told: Any, ticks: int = 1) -> str:
         """The last word of ``ticks`` ticks whose parity is ``told``; the first word that ends the run."""
@@ -64,10 +62,10 @@ class Bench:
 def test_the_axis_that_contradicts_is_left_out_and_the_run_goes_on() -> None:
     bench = Bench().learnt()
     assert not bench.agree(30.0 * NULL[:, 3])
-    assert bench.left_out == bench.ignored == [3]
+    assert bench.left_out == [3]
     (said,) = bench.counts.noticed
     assert said.startswith("acc3 contradicts the other axes: left out")
-    assert "times 1.25" in said
+    assert "noise of the tip's acceleration times 1." in said
     assert bench.frame[PARITY + 1] == 0.0  # one parity is left, and the other is no longer told
     assert not bench.agree((0.0, 0.0), LEARN_TICKS)
 
@@ -82,10 +80,9 @@ def test_the_second_axis_ends_the_run_for_nobody_can_tell_which_it_is() -> None:
 
 def test_what_no_single_axis_explains_is_noticed_and_then_ends_the_run() -> None:
     bench = Bench().learnt()
-    between = np.array([np.cos(np.pi / 16), np.sin(np.pi / 16)])  # as near to axis 0 as to axis 1
-    assert not bench.agree(100.0 * between, PATIENCE_TICKS)
+    assert not bench.agree(100.0 * BETWEEN, PATIENCE_TICKS)
     assert list(bench.counts.noticed) == ["the accelerometer axes contradict each other"]
-    assert "cannot be told" in bench.agree(100.0 * between)
+    assert "cannot be told" in bench.agree(100.0 * BETWEEN)
     assert not bench.left_out
 
 
@@ -93,14 +90,13 @@ def test_before_the_outputs_may_move_an_axis_is_refused_not_left_out() -> None:
     bench = Bench(state=State.SELF_TEST).learnt()
     assert not bench.agree(30.0 * NULL[:, 3])
     assert not bench.left_out
-    between = 100.0 * (NULL[:, 0] + NULL[:, 1])
-    assert bench.agree(between, 2 * PATIENCE_TICKS) == "the accelerometer axes (acc) contradict each other"
+    assert bench.agree(100.0 * BETWEEN, 2 * PATIENCE_TICKS) == "the accelerometer axes (acc) contradict each other"
     assert bench.redundancy.impossible(3, "acc3 is at its rail") == "acc3 is at its rail"
 
 
 def test_axes_that_step_together_are_their_supply() -> None:
     bench = Bench().learnt()
-    bench.check.stepped_together = True
+    bench.check.memory.state["together"][0] = 0
     assert "stepped together" in bench.agree(30.0 * NULL[:, 3])
     assert not bench.left_out
 

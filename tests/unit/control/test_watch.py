@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
 from firmware_py.control.watch import Watch
+from firmware_py.control.wiring import Devices
 from firmware_py.frame import LAYOUT, STATUS, SUPPLY, TEMPERATURE, FrameStatus
+from firmware_py.guardian.care import GuardianCare
 from firmware_py.guardian.heart import Heart, Why
 from firmware_py.run.findings import CauseClass
 from firmware_py.run.safety import SafetyLimits, State
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalTimeout
-from tests.unit.control.stand import StandRun
+from tests.unit.control.stand import StandOutput, StandRun
+from tests.unit.guardian.keeper import Kept
 
 WIDTH = max(column.start + column.size for column in LAYOUT)
 
@@ -52,6 +55,16 @@ class FakeButton:
         return self._silent
 
 
+CHECK = ScanCheck(PlausibilityLimits(), 5.0 / 32768, range(8), [f"input {i}" for i in range(8)])
+
+
+def bench_of(**devices: Any) -> Devices:
+    """The devices of a bench; those that the watch does not look at are absent."""
+    absent = cast(Any, None)
+    wired = {"magnetometer": None, "telemetry": None, **devices}
+    return Devices(daq=absent, scan=absent, amplifier=StandOutput(), sensing_table={}, scan_labels=(), **wired)
+
+
 @pytest.mark.parametrize(
     ("taken", "look", "says"),
     [
@@ -65,14 +78,13 @@ def test_an_output_that_the_guardian_has_moved_is_not_the_amplifiers_fault(taken
     heart = Heart()
     if taken:
         heart.take(Why.SILENT, 7)
-    run = StandRun(guardian=SimpleNamespace(heart=heart))
+    run = StandRun(guardian=GuardianCare(Kept(heart)))
     supervisor = run.supervisor
-    devices = SimpleNamespace(
-        amplifier=SimpleNamespace(name="piezo"),
+    devices = bench_of(
         verify_output=lambda: "output 1 holds 50 V and was told 29 V",
         monitor=FakeMonitor(lambda: "output 1 is at 50 V"),
     )
-    watch = Watch(cast(Any, devices), np.zeros(WIDTH), cast(Any, None), run)
+    watch = Watch(devices, np.zeros(WIDTH), CHECK, run)
     getattr(watch, look)(tick())
     if taken:  # the guardian gives them back
         assert supervisor.holds[0].reason.startswith(says)
@@ -90,13 +102,7 @@ class Watched:
         self.counts = self.run.counts
         self.frame = np.zeros(WIDTH)
         self.frame[TEMPERATURE], self.frame[SUPPLY] = 25.0, 5.0
-        found = {"telemetry": None, "monitor": None, "verify_output": None, **devices}
-        self.watch = Watch(
-            cast(Any, SimpleNamespace(amplifier=SimpleNamespace(name="piezo"), **found)),
-            self.frame,
-            cast(Any, SimpleNamespace(odd=lambda: "")),
-            self.run,
-        )
+        self.watch = Watch(bench_of(**devices), self.frame, CHECK, self.run)
 
     def supervise(self, at_ms: float = 0.0) -> str:
         """Reason of the hold or trip at the end of it, empty while there is none."""
@@ -151,11 +157,13 @@ def test_the_stop_button_and_its_silence() -> None:
 
 
 def test_a_guardian_that_is_lost_holds_the_outputs_and_where_nothing_is_armed_nobody_looks() -> None:
-    lost = SimpleNamespace(look=lambda: "its process has ended")
+    keeper = Kept()
+    lost = GuardianCare(keeper)
+    keeper.alive = False
     assert Watched(guardian=lost).supervise() == (
         "the guardian of the outputs is lost: its process has ended; a new one is started"
     )
-    assert not Watched(guardian=SimpleNamespace(look=lambda: "")).supervise()
+    assert not Watched(guardian=GuardianCare(Kept())).supervise()
     assert not Watched(State.SENSING_ONLY, guardian=lost).supervise()
 
 

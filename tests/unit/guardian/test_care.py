@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,40 +9,12 @@ import pytest
 
 from firmware_py.guardian.care import SILENT_PASSES, START_LIMIT_NS, GuardianCare, start_failed
 from firmware_py.guardian.guardian import State
-from firmware_py.guardian.heart import Heart, Phase, Why
+from firmware_py.guardian.heart import Phase, Why
 from hal.errors import HalError, SafetyTrip
+from tests.unit.guardian.keeper import Kept
 from tests.unit.guardian.test_guardian import Stand
 
 PASS_NS = 10_000_000
-
-
-class Kept:
-    """A keeper that does what the test says."""
-
-    def __init__(self) -> None:
-        self.heart, self.alive, self.started, self.ready = Heart(), True, 0, False
-        self.error: HalError | None = None
-
-    def is_alive(self) -> bool:
-        return self.alive
-
-    def evict(self) -> None:
-        self.alive = False
-
-    def replace(self) -> None:
-        self.evict()
-        self.heart.forget_guardian()
-        self.started += 1
-
-    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any]:
-        self.evict()
-        return {"why": "nothing"}
-
-    def came_up(self) -> bool:
-        if self.error is not None:
-            raise self.error
-        self.alive = self.ready
-        return self.ready
 
 
 def cared() -> tuple[Kept, GuardianCare]:

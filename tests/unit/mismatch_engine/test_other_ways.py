@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +16,10 @@ from sim_devices.physics.step_shift import STEP_SHIFT, edges
 from tests.unit.mismatch_engine.cases import RATE, named, recording, wave
 from tools.mismatch.engine import workers
 from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected
 from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.split import Split
 from tools.mismatch.engine.vary import added
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import moved
@@ -157,11 +158,12 @@ def _twice(x: float) -> float:
 
 
 def test_pieces_in_processes_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = SimpleNamespace(recording=SimpleNamespace(n=100), twin=SimpleNamespace(outputs=("y",)))
+    rec = stack(np.zeros(100), np.zeros(100))
+    problem = Problem(rec, make(rec), Split(100, ((0, 100),), (), (), ()), 0, 0)
     told: list[int] = []
     work = [(float(i),) for i in range(5)]
-    one = workers.mapped(problem, _twice, work, 1, tell=told.append)  # pyright: ignore[reportArgumentType]
+    one = workers.mapped(problem, _twice, work, 1, tell=told.append)
     monkeypatch.setattr(workers, "LEAST_SAMPLES", 0)
-    two = workers.mapped(problem, _twice, work, 2)  # pyright: ignore[reportArgumentType]
+    two = workers.mapped(problem, _twice, work, 2)
     assert one == two == [0.0, 2.0, 4.0, 6.0, 8.0]
     assert told == [1, 2, 3, 4, 5]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +10,8 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.mismatch.engine.found import _units
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.split import Split
 from tools.mismatch.infer import diagnose
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.make import make
@@ -40,7 +41,7 @@ def test_unit(rec: Any, name: str, site: Any, target: str, unit: str, shown: str
     twin = make(rec)
     output = next(iter(rec.outputs))
     placed = Placed(EFFECTS[name], site, target, EFFECTS[name].stages[0], (output,))
-    problem = cast(Any, SimpleNamespace(twin=twin))
+    problem = Problem(rec, twin, Split(rec.n, ((0, rec.n),), (), (), ()), 0, 0)
     assert _units(problem, unit, target, output, placed) == shown
 
 

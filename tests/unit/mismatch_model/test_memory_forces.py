@@ -8,7 +8,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, loop_along
 from sim_devices.physics.hysteresis import dahl
-from tools.mismatch.twins.feedback import run_feedback
+from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 
 NO_SPRING, NONE5, NONE6 = np.zeros(SPRING), np.zeros(COGGING), np.zeros(FRICTION)
 
@@ -18,11 +18,9 @@ def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, 
     ad = np.array([[1.0, dt], [0.0, 1.0]])
     # linear input over a step: exact weights of the values before and after
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
-    x = run_feedback(
-        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.array([x0]),
-        np.zeros(1, np.int64), np.array([u.size]), NONE6, NO_SPRING, NONE5, np.array([radius]), np.array([stiffness]),
-        False,
-    )  # fmt: skip
+    body = Body(ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), False, 1, dt, False)
+    rows = Rows(NONE6, NO_SPRING, NONE5, np.array([radius]), np.array([stiffness]))
+    x = run_feedback(body, rows, u, np.array([x0]), np.zeros(1, np.int64), np.array([u.size]))
     return x[:, 0]
 
 
@@ -46,10 +44,9 @@ def lugre(u: np.ndarray, dt: float, row: np.ndarray) -> np.ndarray:
     ad = np.array([[1.0, dt], [0.0, 1.0]])
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
     row = np.pad(row, (0, FRICTION - row.size))
-    return run_feedback(
-        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.zeros((1, 2)),
-        np.zeros(1, np.int64), np.array([u.size]), row, NO_SPRING, NONE5, np.zeros(0), np.zeros(0), False,
-    )  # fmt: skip
+    body = Body(ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), False, 1, dt, False)
+    rows = Rows(row, NO_SPRING, NONE5, np.zeros(0), np.zeros(0))
+    return run_feedback(body, rows, u, np.zeros((1, 2)), np.zeros(1, np.int64), np.array([u.size]))
 
 
 def test_friction_behind_bristles_is_its_level_while_it_slides() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tools.mismatch.twins.base import Run
 from tools.mismatch.twins.linear import StartState, free_response, response_shape, start_state
 
 N = 600
@@ -19,8 +20,12 @@ def plant() -> tuple[np.ndarray, np.ndarray]:
     return a, np.array([1.0, 1.0, 0.0, 1.0])
 
 
+def run_of(y: np.ndarray, setting: np.ndarray | None = None) -> Run:
+    return Run(np.arange(float(N)), 1.0, {}, (), {"y": y}, (0,), 40, {}, setting)
+
+
 def solved(a: np.ndarray, c: np.ndarray, y: np.ndarray, begin: int) -> StartState:
-    return start_state(a, {"y": c}, {"y": y}, (0,), N, 40, {}, setting=np.arange(begin, N))
+    return start_state(a, {"y": c}, run_of(y, np.arange(begin, N)))
 
 
 def test_a_start_that_the_samples_show_is_met_exactly() -> None:
@@ -60,7 +65,7 @@ def test_two_modes_that_a_short_window_cannot_tell_apart_do_not_run_away_behind_
     rates = np.array([0.001, 0.0012, 0.0015, 0.002])
     a, c = np.diag(np.exp(-rates)), np.ones(4)
     y = np.random.default_rng(5).standard_normal(N)
-    ss = start_state(a, {"y": c}, {"y": y}, (0,), N, 40, {})
+    ss = start_state(a, {"y": c}, run_of(y))
     response = ss.response(ss.states({"y": y}), "y", N)
     assert np.max(np.abs(response)) < 2 * np.ptp(y)
 
@@ -69,7 +74,7 @@ def test_an_integrator_keeps_the_speed_that_its_window_shows() -> None:
     """Its own response runs out of every range, and the forced one brings it back: it is not held."""
     a, c = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([1.0, 0.0])
     y = 3.0 + 0.5 * np.arange(N)
-    ss = start_state(a, {"y": c}, {"y": np.where(np.arange(N) < 40, y, y[39])}, (0,), N, 40, {})
+    ss = start_state(a, {"y": c}, run_of(np.where(np.arange(N) < 40, y, y[39])))
     np.testing.assert_allclose(ss.states({"y": y})[0], [3.0, 0.5], rtol=1e-6)
 
 

@@ -26,7 +26,8 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins.feedback import run_feedback
+from tools.mismatch.twins.base import Run
+from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 from tools.mismatch.twins.linear import (
     discretise,
     felt_at_most,
@@ -296,14 +297,16 @@ def test_linear_kernels_equal_python() -> None:
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for dry, stiff in ((True, 0.0), (False, 60.0)):
         rows[0][5] = stiff
-        args = (d.ad, d.g0, d.g1, cp, cv, u, False, 2, 0.005, x0, starts, np.array([40, 80]), *rows, *more, dry)
+        body = Body(d.ad, d.g0, d.g1, cp, cv, False, 2, 0.005, dry)
+        args = (body, Rows(*rows, *more), u, x0, starts, np.array([40, 80]))
         np.testing.assert_allclose(run_feedback(*args), run_feedback.py_func(*args), atol=1e-13)
 
 
 def test_free_responses_are_kept_while_they_are_felt() -> None:
     d = discretise(np.array([[0.0, 1.0], [-400.0, -16.0]]), np.array([0.0, 1.0]), 0.01, "linear")
     row, measured = np.array([1.0, 0.0]), {"y": np.zeros(5000)}
-    state = start_state(d.ad, {"y": row}, measured, (0,), 5000, 20, {})
+    run = Run(0.01 * np.arange(5000), 0.01, {}, (), measured, (0,), 20, {})
+    state = start_state(d.ad, {"y": row}, run)
     assert state.free["y"].shape[0] < 600
     x0 = np.array([[0.3, -2.0]])
     whole = free_response(d.ad, row, 5000) @ x0[0]

@@ -145,7 +145,7 @@ def assemble(
         recording=str(rec.path),
         twin=twin.kind,
         verdict=verdict,
-        summary=summary(decision, physics, guilty, depends, problem, base, fitted),
+        summary=summary(decision, physics, guilty, depends, problem, (base, fitted)),
         location=Location(
             tuple(guilty),
             stage,
@@ -289,10 +289,13 @@ def summary(
     guilty: Sequence[str],
     depends: Sequence[DependsOn],
     problem: Problem,
-    base: Fit,
-    fitted: Fit,
+    fits: tuple[Fit, Fit],
 ) -> str:
-    """Summarise the answer in a sentence for a bench engineer, and a large rest in a second one."""
+    """Summarise the answer in a sentence for a bench engineer, and a large rest in a second one.
+
+    ``fits``: the twin alone and with the physics.
+    """
+    base, fitted = fits
     verdict, outputs = decision.verdict, ", ".join(guilty)
     a, b = held_rms(problem, base), held_rms(problem, fitted)
     if verdict == "agrees":

@@ -264,14 +264,14 @@ def fit(
         cost = np.inf
         if not give_up:
             least = min(rows, ground.fit_rows.size)
-            theta, cost, count = _finely(ground, model, outputs, theta, least, iterations, rounds, tolerance)
+            theta, cost, count = _finely(ground, model, outputs, theta, Effort(least, iterations, rounds, tolerance))
             evaluations += count
         if found is None or (np.isfinite(cost) and cost < found[0]):
             found = (cost, theta)
     assert found is not None
     cost, theta = found
     if opening is not None and not give_up and np.isfinite(cost):
-        theta, cost, count = _finely(problem, model, outputs, theta, rows, 10, rounds, tolerance)
+        theta, cost, count = _finely(problem, model, outputs, theta, Effort(rows, 10, rounds, tolerance))
         evaluations += count
     elif give_up and opening is not None:
         _, theta = Projected(problem, model, outputs, rows).evaluate(theta)
@@ -313,17 +313,25 @@ def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tupl
     return [(cost / size, theta) for cost, _, theta in tried], projected.evaluations
 
 
+@dataclass(frozen=True)
+class Effort:
+    """Limits a search: rows of each output, iterations and tolerance of each round, rounds of reduced weights."""
+
+    rows: int
+    iterations: int
+    rounds: int
+    tolerance: float
+
+
 def _finely(
     problem: Problem,
     model: Model,
     outputs: Sequence[str],
     theta: Array,
-    rows: int,
-    iterations: int,
-    rounds: int,
-    tolerance: float,
+    effort: Effort,
 ) -> tuple[Array, float, int]:
-    """Return (theta, cost, evaluations) after a search on ``rows`` and another with reduced weights of outliers."""
+    """Return (theta, cost, evaluations) after a search on some rows and another with reduced weights of outliers."""
+    rows, iterations, rounds, tolerance = effort.rows, effort.iterations, effort.rounds, effort.tolerance
     before = 0
     if rows > 2 * SEARCH_ROWS:
         # the search begins on part of the rows and ends on all of them

@@ -103,13 +103,11 @@ def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
         return None
     pure = Filter((), (), 1.0)
     given = _filter_of(twin, raw.theta)
-    ends = [
-        _left(u, y, *s, rec.dt, twin.hold, used, judged)
-        for s in ((pure, whole), (whole, pure), (pure, given), (given, pure))
-    ]
+    on = _Trial(u, y, rec.dt, twin.hold, used, judged)
+    ends = [_left(on, *s) for s in ((pure, whole), (whole, pure), (pure, given), (given, pure))]
     found: list[tuple[float, int, tuple[Filter, Filter]]] = []
     for i, pair in enumerate(itertools.islice(_splits(whole, twin.hold, rec.dt), MOST_SPLITS)):
-        found.append((_left(u, y, *pair, rec.dt, twin.hold, used, judged), i, pair))
+        found.append((_left(on, *pair), i, pair))
     if not found:
         return None
     left, _, (first, second) = min(found, key=lambda f: f[:2])
@@ -201,17 +199,27 @@ def _value(zeros: Sequence[complex], poles: Sequence[complex], at: float) -> flo
     return float(np.real(np.prod([at - z for z in zeros]) / np.prod([at - p for p in poles])))
 
 
-def _left(
-    u: Array, y: Array, first: Filter, second: Filter, dt: float, hold: Hold, used: NDArray[np.int64],
-    judged: NDArray[np.int64],
-) -> float:  # fmt: skip
-    """Return the mean square on the ``judged`` samples with a curve between two filters, fitted on those ``used``."""
+@dataclass(frozen=True)
+class _Trial:
+    """Holds what every pair of filters is tried on: input and output (n,), samples that are fitted and that judge."""
+
+    u: Array
+    y: Array
+    dt: float
+    hold: Hold
+    used: NDArray[np.int64]
+    judged: NDArray[np.int64]
+
+
+def _left(on: _Trial, first: Filter, second: Filter) -> float:
+    """Return the mean square on the judged samples with a fitted curve between two filters."""
+    y, dt, hold, used, judged = on.y, on.dt, on.hold, on.used, on.judged
     with np.errstate(all="ignore"):
-        x = first.run(u, dt, hold)
+        x = first.run(on.u, dt, hold)
         if not np.all(np.isfinite(x)) or np.ptp(x) == 0.0:
             return np.inf
         bends = [np.maximum(x - k, 0.0) for k in np.unique(np.quantile(x, KNOTS))]
-        columns = [np.ones(u.size), *(second.run(c, dt, hold) for c in (x, *bends))]
+        columns = [np.ones(y.size), *(second.run(c, dt, hold) for c in (x, *bends))]
         design = np.stack(columns, axis=1)
         if not np.all(np.isfinite(design)):
             return np.inf

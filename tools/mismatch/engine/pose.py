@@ -144,15 +144,7 @@ class Posed:
     hold: Hold | None
 
 
-def pose(
-    recording: Recording,
-    held_out: float,
-    seed: int,
-    jobs: int,
-    progress: Progress | None,
-    effects: Iterable[Effect] | None,
-    look: Look,
-) -> Posed:
+def pose(recording: Recording, held_out: float, seed: int, effects: Iterable[Effect] | None, look: Look) -> Posed:
     """Prepare everything that comes before the search: runs joined, circuits opened, hold of the inputs, noise.
 
     ``look`` searches a part of a very long recording.

@@ -17,7 +17,7 @@ from tools.mismatch import units
 from tools.mismatch.export import parts
 from tools.mismatch.export.effects import PER_FORCE, Slot, Writer, force, numbers, written
 from tools.mismatch.export.equations import EquationLines, Inner
-from tools.mismatch.export.motion import motion, substeps_of
+from tools.mismatch.export.motion import PlantCode, motion, substeps_of
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe
@@ -242,7 +242,7 @@ class _Module:
             self.writer.used |= {"smoothed"}
             hold, drive = "linear", f"smoothed({drive})"
         if forces:
-            self._forced(twin, forces, a, b, place, speed, str(hold), start)
+            self._forced(twin, forces, PlantCode(a, b, place, speed, str(hold), start))
             add(f"x = moving({drive})")
         else:
             self.writer.part("linear", f"{a}, {b}, dt, {str(hold)!r}, {start}", "moving")
@@ -263,13 +263,11 @@ class _Module:
         through = f" + {d}[0, 0] * {drive}" if np.any(np.asarray(table["D"]) != 0.0) else ""
         self.writer.run.append(f"{BETWEEN} = in_front(({drive})[:, None]) @ {c}[0]{through}")
 
-    def _forced(
-        self, twin: DynamicTwin, forces: list[int], a: str, b: str, place: str, speed: str, hold: str, start: str
-    ) -> None:
+    def _forced(self, twin: DynamicTwin, forces: list[int], plant: PlantCode) -> None:
         codes = [force(self._slot(k, self.model.placed[k].outputs[0])) for k in forces]
         self.writer.used |= {"discretise"}
         substeps = substeps_of(twin, self.model, self.theta, self.recording, forces)
-        self.writer.setup += motion(codes, a, b, place, speed, hold, start, substeps)
+        self.writer.setup += motion(codes, plant, substeps)
 
     def _equations(self, twin: OdeTwin) -> None:
         for name, value in zip(twin.names, twin.values(self.theta).tolist(), strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,9 +36,19 @@ def substeps_of(twin: DynamicTwin, model: Model, theta: Array, recording: Record
     return twin._substeps(view_run(twin, View.whole(recording)), packed, push)
 
 
-def motion(
-    codes: Sequence[ForceCode], a: str, b: str, place: str, speed: str, hold: str, start: str, substeps: int
-) -> list[str]:
+@dataclass(frozen=True)
+class PlantCode:
+    """Holds the code of a linear plant: its matrices, the rows of position and velocity, and its start state."""
+
+    a: str
+    b: str
+    place: str
+    speed: str
+    hold: str
+    start: str
+
+
+def motion(codes: Sequence[ForceCode], plant: PlantCode, substeps: int) -> list[str]:
     """Return the lines of ``moving(drive)``: a linear plant with forces of its position x and velocity v in free run.
 
     The scheme is that of ``twins.feedback.run_feedback``, written out for the forces of the twin.
@@ -48,12 +59,12 @@ def motion(
     lean = next((c.lean for c in codes if c.lean), "")
     radii = next((c.radii for c in codes if c.radii), "")
     springs = next((c.springs for c in codes if c.springs), "")
-    straight = hold == "linear"
+    straight = plant.hold == "linear"
     step = "dt" if substeps == 1 else f"dt / {substeps}"
     lines = [
-        f"ad, g0, g1 = discretise({a}, {b}, {step}, {hold!r})",
-        f"g0, g1, place, speed = g0[:, 0], g1[:, 0], {place}, {speed}  # rows of position and velocity",
-        f"s, before = {start}, None",
+        f"ad, g0, g1 = discretise({plant.a}, {plant.b}, {step}, {plant.hold!r})",
+        f"g0, g1, place, speed = g0[:, 0], g1[:, 0], {plant.place}, {plant.speed}  # rows of position and velocity",
+        f"s, before = {plant.start}, None",
     ]
     terms, later = (["smooth(place @ s, speed @ s)"], ["smooth(place @ z, speed @ z)"]) if smooth else ([], [])
     memory = ["s", "before"]

@@ -51,7 +51,7 @@ def infer(
     """Prepare the recording and search, without a decision. The linear algebra uses one thread."""
     kept, unsealed = seal(recording)
     with threadpool_limits(1):
-        posed = pose(kept, held_out, seed, jobs, progress, effects, partial(look, constants, jobs, progress))
+        posed = pose(kept, held_out, seed, effects, partial(look, constants, jobs, progress))
         found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
     return Inferred(posed, found, recording, unsealed)
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
 from tools.mismatch.recording import Recording
 
+LEAST_WINDOW = 20
+"""Least number of samples that set a start state, in a record that has so many."""
 Counted = Literal["", "start", "rest"]
 """Origin of a position of which only the rate was recorded: the start of the record, or a spring at rest."""
 
@@ -77,6 +79,11 @@ class Run:
     period: int = 0
     afresh: tuple[int, ...] = (0,)
     bent: bool = False
+
+    @property
+    def start_window(self) -> int:
+        """Return the number of samples after each start that set its state where the data set any."""
+        return max(self.window, min(LEAST_WINDOW, self.t.size))
 
 
 class Twin(Protocol):

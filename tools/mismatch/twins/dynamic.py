@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import UNCENTRED
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, remember, travelled
-from tools.mismatch.twins.feedback import Rows, pack, run_feedback
+from tools.mismatch.twins.feedback import Body, Rows, pack, run_feedback
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import (
     Discrete,
@@ -27,7 +27,6 @@ from tools.mismatch.twins.linear import (
 
 CONSTANT = ""  # the input "1"
 MOST_SUBSTEPS = 24
-LEAST_WINDOW = 20  # default number of samples that set a state
 
 
 @dataclass(frozen=True)
@@ -217,7 +216,7 @@ class DynamicTwin(Head):
                     if not np.any(c):
                         continue
                     if b - a == 2:
-                        y[o] += run_pair(part.ad, part.g0, part.g1, c[0], c[1], u, at)
+                        y[o] += run_pair(part.ad, part.g0, part.g1, c, u, at)
                     else:
                         y[o] += run_output(part.ad, part.g0, part.g1, c, u, at)
             if ss is not None:
@@ -274,11 +273,7 @@ class DynamicTwin(Head):
             c = np.zeros(ad.shape[0])
             c[list(r) if isinstance(r, tuple) else r] = 1.0
             rows[o] = c
-        window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        starts, n = run.starts, run.t.size
-        return start_state(
-            ad, rows, run.measured, starts, n, window, run.memo, setting=run.setting, blocks=blocks
-        )  # fmt: skip
+        return start_state(ad, rows, run, blocks=blocks)
 
     def _substeps(self, run: Run, packed: Rows, push: float) -> int:
         """Return the steps per sample, a power of two so that it seldom changes during a fit.
@@ -351,16 +346,13 @@ class DynamicTwin(Head):
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
         held = self.hold in ("zero", "discrete")
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
+        body = Body(d.ad, d.g0, d.g1, cp, cv, held, sub, run.dt / sub, dry)
 
         def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
             if not forces:
                 return run_states(d.ad, d.g0, d.g1, drive, x0, first)
-            return run_feedback(
-                d.ad, d.g0, d.g1, cp, cv, drive, held, sub, run.dt / sub, x0, first, stop,
-                packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,
-            )  # fmt: skip
+            return run_feedback(body, packed, drive, x0, first, stop)
 
-        window = max(run.window, min(LEAST_WINDOW, run.t.size))
         if (
             self.fixed_free is not None
             and run.starts == (0,)
@@ -371,7 +363,7 @@ class DynamicTwin(Head):
             x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
         full = np.linalg.matrix_power(d.ad, sub)
-        ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
+        ss = start_state(full, rows, replace(run, setting=None), whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
         if forces and self.counted:
             # the rows of the outputs do not show where it stands; how it came there was recorded
@@ -382,7 +374,7 @@ class DynamicTwin(Head):
                 x = go(begin, u, starts, ends)
                 return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
         # the windows that set the state are simulated alone, one after the other
-        stop = np.asarray(np.minimum(starts + window, ends), np.int64)
+        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
         after = np.cumsum(stop - starts)
         before = after - (stop - starts)

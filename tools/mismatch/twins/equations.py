@@ -14,7 +14,7 @@ from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import FLOW
 from tools.guest.equations import Program
 from tools.mismatch.twins.feedback import Rows
-from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
+from tools.mismatch.twins.ode_run import SWAY, Drive, Packed, rates_of, run_equations, run_readings
 
 LEAST_SHOWN = 3e-4  # least singular value of a fitted combination of start states, relative to the largest
 
@@ -43,26 +43,31 @@ class Inside:
     """Packs forces and flows of a run for the compiled loop (``ode_run.run_equations``)."""
 
     place: NDArray[np.int64]
+    """Indices (p, 4) of the states that hold position and velocity, of the one whose derivative the force is added to,
+    and 1 if any force there is smooth."""
     rows: tuple[Rows, ...]
     flows: Array
     sway: Array
     fastest_per_s: float = 0.0
 
     @cached_property
-    def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:
-        """Return friction, spring, cogging, counts, thresholds and memory."""
+    def packed(self) -> Packed:
+        """Return the forces of all places, one behind the other, as the compiled loop takes them."""
         rows = self.rows
 
         def join(parts: list[Array]) -> Array:
             return np.concatenate(parts) if parts else np.zeros(0)
 
-        return (
+        return Packed(
+            self.place,
             join([r.friction for r in rows]),
             join([r.spring for r in rows]),
             join([r.cogging for r in rows]),
             np.array([r.thresholds.size for r in rows], np.int64),
             join([r.thresholds for r in rows]),
             join([r.memory for r in rows]),
+            self.flows,
+            self.sway,
         )
 
 
@@ -72,11 +77,8 @@ NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((
 class Equations(Protocol):
     """Defines the derivatives and outputs of a model, independent of how they are computed."""
 
-    def states(
-        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
-        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
-    ) -> Array:  # fmt: skip
-        """Return the states (n, s) of a free run; ``times`` (n,) in seconds; ``values`` are the parameters."""
+    def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
+        """Return the states (n, s) of a free run; ``values`` are the parameters, ``limits`` those of each state."""
         ...
 
     def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
@@ -97,32 +99,22 @@ class Programs:
     at: int
     """Index of the register of the first parameter."""
 
-    def states(
-        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
-        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
-    ) -> Array:  # fmt: skip
+    def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
         """See Equations."""
-        p = self.rates_program
-        friction, spring, cogging, counts, thresholds, memory = inside.arrays
-        return run_equations(
-            p.operations, self._set(p, values), p.results, inside.sway, x0, starts, stop, u, held, times, step_s,
-            sub, inside.place, friction, spring, cogging, counts, thresholds, memory, inside.flows, *limits,
-        )  # fmt: skip
+        return run_equations(self._set(self.rates_program, values), drive, inside.packed, x0, limits)
 
     def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
         """See Equations."""
-        return run_readings(self.outputs.operations, self._set(self.outputs, values), self.outputs.results, x, u, t)
+        return run_readings(self._set(self.outputs, values), x, u, t)
 
     def rates(self, x: Array, u: Array, values: Array) -> Array:
         """See Equations."""
-        p, rates = self.rates_program, np.empty(x.size)
-        rates_of(p.operations, self._set(p, values), p.results, x, u, 0.0, rates)
-        return rates
+        return rates_of(self._set(self.rates_program, values), x, u)
 
-    def _set(self, program: Program, values: Array) -> Array:
+    def _set(self, program: Program, values: Array) -> Program:
         registers = program.registers.copy()
         registers[self.at : self.at + values.size] = values
-        return registers
+        return program._replace(registers=registers)
 
 
 @dataclass(frozen=True)

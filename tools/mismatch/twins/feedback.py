@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ FASTEST = "fastest_per_s"
 follows that rate, so that a corrected twin, whose own modes differ, is integrated like the original fit."""
 
 
-@dataclass(frozen=True)
-class Rows:
+class Rows(NamedTuple):
     """Packs the parameters of all feedback effects of a model; ``fastest_per_s``: see ``FASTEST``, 0 if unknown."""
 
     friction: Array
@@ -70,19 +69,38 @@ def pack(forces: Sequence[Force]) -> Rows:
     )
 
 
-@kernel
-def run_feedback(
-    ad, g0, g1, cp, cv, u, held, sub, step_s, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
-):
-    """Return states (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
+class Body(NamedTuple):
+    """Holds a linear plant, discretised, whose position and velocity forces depend on."""
 
-    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces and memory vary linearly over
+    ad: Array
+    """Transition (s, s) over a step; ``g0`` and ``g1`` (s,) belong to it (``linear.Discrete``)."""
+    g0: Array
+    g1: Array
+    position: Array
+    """Row (s,) of the position."""
+    velocity: Array
+    """Row (s,) of the velocity."""
+    held: bool
+    """True if the input is held between its samples, False if it runs straight."""
+    sub: int
+    """Number of steps per sample."""
+    step_s: float
+    dry: bool
+    """True if dry friction can hold the body."""
+
+
+@kernel
+def run_feedback(body, rows, u, x0, starts, stop):
+    """Return states (n, s) of a ``Body`` with forces (``Rows``) added to the input u (n,), from x0 (starts, s).
+
+    The linear part is exact over a step. Smooth forces and memory vary linearly over
     the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it reduces the
     velocity by as much as its limit allows and at most to rest (time stepping; Acary, Brogliato, Numerical Methods for
     Nonsmooth Dynamical Systems, 2008, section 1.4). With bristles (``friction[5]`` > 0) it is the LuGre model, its
-    state exact at the mean speed of a step of ``step_s``. ``cp``, ``cv``: rows of position and velocity.
-    ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
+    state exact at the mean speed of a step. ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
     """
+    ad, g0, g1, cp, cv, held, sub, step_s, dry = body
+    friction, spring, cogging, thresholds, memory, _ = rows
     n, s = u.size, ad.shape[0]
     out = np.zeros((n, s))
     x = np.zeros(s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.exponential import exponential
+
+if TYPE_CHECKING:
+    from tools.mismatch.twins.base import Run
 
 Hold = Literal["zero", "linear", "smooth", "discrete"]
 """Course of an input between its samples: held, straight, or without content above half the sampling rate."""
@@ -143,8 +146,8 @@ def run_states(ad, g0, g1, u, x0, starts):
 
 
 @kernel
-def run_pair(ad, g0, g1, c0, c1, u, starts):
-    """Return ``c0 x[0] + c1 x[1]`` (n,) of a second-order plant for an input (n,), from zero state at each start."""
+def run_pair(ad, g0, g1, c, u, starts):
+    """Return ``c @ x`` (n,) of a second-order plant for an input (n,), from zero state at each start."""
     n = u.size
     out = np.empty(n)
     a00, a01, a10, a11 = ad[0, 0], ad[0, 1], ad[1, 0], ad[1, 1]
@@ -161,7 +164,7 @@ def run_pair(ad, g0, g1, c0, c1, u, starts):
             v = a00 * p + a01 * q + b0 * u[k - 1] + d0 * u[k]
             q = a10 * p + a11 * q + b1 * u[k - 1] + d1 * u[k]
             p = v
-        out[k] = c0 * p + c1 * q
+        out[k] = c[0] * p + c[1] * q
     return out
 
 
@@ -311,23 +314,15 @@ MOST_SETTING = 4000
 
 
 def start_state(
-    ad: Array,
-    rows: dict[str, Array],
-    measured: Mapping[str, Array],
-    starts: tuple[int, ...],
-    n: int,
-    window: int,
-    memo: dict[object, object],
-    whole: bool = True,
-    setting: NDArray[np.int64] | None = None,
-    blocks: tuple[tuple[int, int], ...] = (),
+    ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = True, blocks: tuple[tuple[int, int], ...] = ()
 ) -> StartState:
     """Prepare the least squares for output rows c (s,) of the outputs that may set the state.
 
-    The first ``window`` samples after each start set its state; with ``setting`` (sorted sample numbers) those of them
-    that lie behind the start do, as long as the start is felt. Without ``whole``, free responses reach over the windows
+    The first samples after each start (``run.start_window``) set its state; with ``run.setting`` those of them that lie
+    behind the start do, as long as the start is felt. Without ``whole``, free responses reach over the windows
     only: states can be had, responses cannot. ``blocks``: of a block-diagonal ``ad``.
     """
+    starts, n, window, setting, memo = run.starts, run.t.size, run.start_window, run.setting, run.memo
     how = ("set", setting.size) if setting is not None else ("window", window)
     key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, how, whole)
     found = memo.get(key)
@@ -343,7 +338,7 @@ def start_state(
     if len(rows) > 1:
         # outputs of different units weigh alike over the samples that may set the state
         seen = np.concatenate(at)
-        weight = {o: 1.0 / (float(np.std(measured[o][seen])) or 1.0) for o in rows}
+        weight = {o: 1.0 / (float(np.std(run.measured[o][seen])) or 1.0) for o in rows}
     known: dict[bytes, Array] = {}
     solvers: list[Array] = []
     stretch = max(b - a for a, b in spans)
@@ -351,7 +346,7 @@ def start_state(
     shape = np.concatenate([response_shape(ad, c, horizon, blocks) * weight[o] for o, c in rows.items()])
     rough = max(
         LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW,
-        *(_roughness(measured[o], memo, o) for o in rows),
+        *(_roughness(run.measured[o], memo, o) for o in rows),
     )
     for (a, _), samples in zip(spans, at, strict=True):
         since = samples - a

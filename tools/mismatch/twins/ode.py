@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,10 +31,9 @@ from tools.mismatch.twins.equations import (
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
-from tools.mismatch.twins.ode_run import SWAY
+from tools.mismatch.twins.ode_run import SWAY, Drive
 
 MOST_SUBSTEPS = 200
-LEAST_WINDOW = 20
 FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
 
 
@@ -278,12 +277,11 @@ class OdeTwin(Head):
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
 
-        def go(
-            x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array,
-            sub: int = sub, values: Array = values, inside: Inside = inside,
-        ) -> Array:  # fmt: skip
-            held = np.full(len(self.signals), self.held)
-            return self.equations.states(x0, first, stop, u, held, t, run.dt, sub, values, inside, limits)
+        held = np.full(len(self.signals), self.held)
+
+        def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
+            drive = Drive(u, held, t, run.dt, sub, first, stop)
+            return self.equations.states(x0, drive, values, inside, limits)
 
         given = np.array([[x.start for x in self.state_list]])
         if run.window == 0 and run.starts == (0,) and (np.any(given) or not run.period):
@@ -300,8 +298,7 @@ class OdeTwin(Head):
             if begin is not None:
                 return go(begin, starts, ends, u, run.t)
         # the windows that set the state are simulated alone, one after the other
-        window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        stop = np.asarray(np.minimum(starts + window, ends), np.int64)
+        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
         after = np.cumsum(stop - starts)
         before = after - (stop - starts)
@@ -316,8 +313,9 @@ class OdeTwin(Head):
 
         def plain() -> Array:
             # a run of the engineer's own model from its own start gives first guesses for later stretches
-            end, sub = np.array([run.t.size], np.int64), self.substeps(run.dt, NOTHING)
-            return go(given, starts[:1], end, u, run.t, sub, self.start_values, NOTHING)[starts]
+            end = np.array([run.t.size], np.int64)
+            drive = Drive(u, held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
+            return self.equations.states(given, drive, self.start_values, NOTHING, limits)[starts]
 
         x0 = remember(run.memo, ("about", run.starts), plain)
         x0 = self.as_read(np.where(np.isfinite(x0), x0, given), y[before], part[before], t[before], values)
@@ -367,9 +365,7 @@ class OdeTwin(Head):
             b[self.place(signal).target] = 1.0
         d = discretise(lin.a, b, run.dt, "zero" if self.held else "linear")
         c = dict(zip(self.outputs, lin.c, strict=True))
-        window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        setting = run.setting if self.integrates else None
-        ss = start_state(d.ad, c, run.measured, run.starts, run.t.size, window, run.memo, setting=setting)
+        ss = start_state(d.ad, c, run if self.integrates else replace(run, setting=None))
         at = np.array(run.starts, np.int64)
 
         def carry(change: Array) -> Array:

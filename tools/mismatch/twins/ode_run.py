@@ -2,23 +2,63 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.compiled import kernel
+from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import FRICTION, bristle_after, flow_of, friction_limit, smooth_force
 from tools.mismatch.twins.program import run_program
 
 SWAY = 4  # number of columns of a varying parameter: its register, the register that it follows, strength, centre
 
 
-@kernel
-def rates_of(operations, registers, results, x, u, t, rates):
-    """Compute derivatives ``rates`` (s,) of the states ``x`` (s,) at the inputs ``u`` (m,), without forces.
+class Drive(NamedTuple):
+    """Holds the inputs of a run of equations and the stretches in which it runs free."""
 
-    Registers: time, states, inputs (and recorded signals), parameters.
+    u: Array
+    """Inputs (n, m). Between samples they run straight, or are held where ``held`` (m,) is set."""
+    held: NDArray[np.bool_]
+    times: Array
+    """Seconds (n,) of each sample."""
+    step_s: float
+    sub: int
+    """Number of steps per sample."""
+    starts: NDArray[np.int64]
+    """First sample of each stretch."""
+    stop: NDArray[np.int64]
+    """Sample behind the last one of each stretch."""
+
+
+class Packed(NamedTuple):
+    """Holds the forces, flows and varying parameters of a run, those of all places one behind the other."""
+
+    place: NDArray[np.int64]
+    """See ``equations.Inside``."""
+    friction: Array
+    spring: Array
+    cogging: Array
+    counts: NDArray[np.int64]
+    """Number of thresholds of each place."""
+    thresholds: Array
+    memory: Array
+    flows: Array
+    sway: Array
+    """Parameters (k, 4) that follow a state or a signal: p (1 + strength (value - centre)); see ``SWAY``."""
+
+
+@kernel
+def rates_of(program, x, u):
+    """Return the derivatives (s,) of the states ``x`` (s,) at the inputs ``u`` (m,) at time zero, without forces.
+
+    Registers of the program, which change: time, states, inputs (and recorded signals), parameters.
     """
+    operations, registers, results = program
     s, m = x.size, u.size
-    registers[0] = t
+    rates = np.empty(s)
+    registers[0] = 0.0
     for i in range(s):
         registers[1 + i] = x[i]
     for i in range(m):
@@ -26,21 +66,14 @@ def rates_of(operations, registers, results, x, u, t, rates):
     run_program(operations, registers)
     for i in range(s):
         rates[i] = registers[results[i]]
+    return rates
 
 
 @kernel
-def run_equations(
-    operations, registers0, results, sway, x0, starts, stop, u, held, times, step_s, sub,
-    place, friction, spring, cogging, counts, thresholds, memory, flows, lowest, highest,
-):  # fmt: skip
-    """Return states (n, s) of a free run from ``x0`` (starts, s) by fourth-order Runge-Kutta, ``sub`` steps per sample.
+def run_equations(program, drive, packed, x0, limits):
+    """Return states (n, s) of a free run from ``x0`` (starts, s) by fourth-order Runge-Kutta.
 
-    Between samples the inputs ``u`` (n, m) run straight, or are ``held`` (m,). States stay within ``lowest`` and
-    ``highest`` (s,). ``stop`` (starts,) ends a stretch. ``times`` (n,): seconds of each sample.
-
-    ``sway`` (k, 4): parameters that follow a state or a signal: p (1 + strength (value - centre)). ``place`` (p, 4):
-    states that hold position and velocity, whose derivative a force is added to, and whether any force there is smooth.
-    ``friction``, ``spring``, ``cogging``: rows of all places, one behind the other.
+    ``drive``: a ``Drive``; ``packed``: ``Packed``. States stay within ``limits``, lowest and highest (s,).
 
     Dry friction is set-valued: within a step the direction of slip is fixed; where the velocity crosses zero the body
     rests while the other forces are within the limit, else the rest of the step is slip the other way (Karnopp, J. Dyn.
@@ -49,6 +82,10 @@ def run_equations(
     The derivative is computed in one place of the loop and not in a function: a call that passes arrays counts
     references to each of them, which costs more than the equations.
     """
+    operations, registers0, results = program
+    u, held, times, step_s, sub, starts, stop = drive
+    place, friction, spring, cogging, counts, thresholds, memory, flows, sway = packed
+    lowest, highest = limits
     n, m = u.shape
     s = x0.shape[1]
     places = place.shape[0]
@@ -203,8 +240,9 @@ def run_equations(
 
 
 @kernel
-def run_readings(operations, registers0, results, x, u, t):
+def run_readings(program, x, u, t):
     """Return outputs (n, q) for states (n, s), inputs (n, m) and times (n,)."""
+    operations, registers0, results = program
     n = u.shape[0]
     out = np.empty((n, results.size))
     registers = registers0.copy()

@@ -19,6 +19,7 @@ from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, State, linearise, rates_at
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
+from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.program import parse
 
 TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")
@@ -130,10 +131,10 @@ def _as_given(
         a = linearise(equations, x0[0], u[0], typical, values).a
         fastest = float(np.max(np.abs(np.linalg.eigvals(a)))) if np.all(np.isfinite(a)) else 1.0 / recording.dt
         sub = int(np.clip(np.ceil(recording.dt * fastest / 0.25), 1, 200))
-        x = equations.states(
-            x0, np.zeros(1, np.int64), np.array([n], np.int64), np.ascontiguousarray(u), np.full(u.shape[1], held),
-            recording.t, recording.dt, sub, values, NOTHING, limits,
-        )  # fmt: skip
+        inputs, straight = np.ascontiguousarray(u), np.full(u.shape[1], held)
+        whole = np.zeros(1, np.int64), np.array([n], np.int64)
+        drive = Drive(inputs, straight, recording.t, recording.dt, sub, *whole)
+        x = equations.states(x0, drive, values, NOTHING, limits)
     if not np.all(np.isfinite(x)):
         k = int(np.argmax(~np.isfinite(x).all(axis=1)))
         name = states[int(np.argmax(~np.isfinite(x[k])))].name
