@@ -6,7 +6,7 @@ multifunction devices have, so it measures what the converter really gives.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,10 +74,11 @@ class NidaqmxOutput(GuardedOutput):
         outputs."""
         return nidaqmx_package.identify_card(self._nidaqmx, self._device, self.name, "ao", highest=self._highest)
 
-    def arm(self) -> None:
+    def arming(self) -> Iterator[None]:
+        """Ramp to neutral and compare what is measured with it."""
         self._known = False
         while not self.safe_step():
-            self._clock.sleep_until_ns(self._clock.now_ns() + TICK_NS)
+            yield
         measured_V = self.readback_V() / self._gain
         wanted = np.array([limit.safe_V for limit in self.limits]) / self._gain
         self.guard.require(

@@ -6,10 +6,11 @@ over the same memory (``GuardState.view``).
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
+from drivers.base import wait_s
 from drivers.output_guard_steps import (
     ARMED,
     CLIPPED,
@@ -26,7 +27,7 @@ from drivers.output_guard_steps import (
     next_ramp_step,
     note_sent,
 )
-from hal.contracts import Clock, Float64Array
+from hal.contracts import ARMING_STEP_S, Clock, Float64Array
 from hal.errors import ErrorKind, HalError, SafetyTrip
 from hal.types import OutputLimit
 
@@ -177,6 +178,16 @@ class GuardedOutput:
 
     name: str
     guard: OutputGuard
+    _clock: Clock
+
+    def arming(self) -> Iterator[None]:
+        """See ``ArmsInSteps``."""
+        raise NotImplementedError
+
+    def arm(self) -> None:
+        """Do the steps of ``arming`` one after another."""
+        for _ in self.arming():
+            wait_s(self._clock, ARMING_STEP_S)
 
     @property
     def commands_sent(self) -> int:

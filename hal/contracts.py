@@ -7,8 +7,8 @@ Each bus has one required method (embedded-hal). A timeout bounds one whole call
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,4 +166,28 @@ class AnalogOutput(Protocol):
 
     def close(self) -> None:
         """Go to the safe state unless it is reached, then release the device."""
+        ...
+
+
+@runtime_checkable
+class BuffersScans(Protocol):
+    """An ``AnalogInputScan`` whose device keeps few scans, and whose driver can keep more."""
+
+    def take_in(self) -> None:
+        """Take what the device holds into the driver's memory, without waiting; ``read_scans`` delivers it and says
+        what is wrong with it."""
+        ...
+
+
+ARMING_STEP_S = 0.001
+"""Time that passes after each step of ``ArmsInSteps.arming``."""
+
+
+@runtime_checkable
+class ArmsInSteps(Protocol):
+    """An analog output whose arming leaves its caller free to do something else in between."""
+
+    def arming(self) -> Iterator[None]:
+        """Do what ``arm`` does; after each step the caller lets ``ARMING_STEP_S`` pass. An output is not armed before
+        the last step."""
         ...

@@ -124,7 +124,7 @@ class CanAmplifier(GuardedOutput):
         while self.bus.recv(0.0) is not None:
             pass
 
-    def arm(self) -> None:
+    def arming(self) -> Iterator[None]:
         """Ask the node to arm, ramp to neutral, verify counter and measured voltages in a status frame."""
         self._fresh_status(STATUS_LIMIT_NS * 1e-9)
         self.guard.require(self.state != FAULT, "the node reports a fault: switch it off and on")
@@ -137,11 +137,13 @@ class CanAmplifier(GuardedOutput):
         limit_ns = self._clock.now_ns() + STATUS_LIMIT_NS
         while self.state != ARMED:
             self.guard.require(self._clock.now_ns() < limit_ns, "the node does not confirm 'arm'")
-            self._hold_one_tick()
+            self._hold()
+            yield
         done = False
         while not done:
             done = self.guard.ramp()
-            self._hold_one_tick()
+            self._hold()
+            yield
         limit_ns = self._clock.now_ns() + STATUS_LIMIT_NS
         neutral_V = np.array([limit.safe_V for limit in self.limits])
         counter = words[COUNTER]
@@ -151,7 +153,8 @@ class CanAmplifier(GuardedOutput):
                 f"commanded {neutral_V.tolist()} V, the node measures {self.measured_V.round(2).tolist()} V and is "
                 f"{STATE_NAMES[self.state]}",
             )
-            self._hold_one_tick()
+            self._hold()
+            yield
         words[SAFE_STEPS] = 0
         self.pending = None
         self.guard.armed = True
@@ -196,7 +199,8 @@ class CanAmplifier(GuardedOutput):
         asked_ns = self._clock.now_ns()
         while self.node.words[STATUS_NS] <= asked_ns:
             self._require_link()
-            self._hold_one_tick()
+            self._hold()
+            wait_s(self._clock, TICK_S)
         return self.measured_V
 
     def close(self) -> None:
@@ -241,11 +245,10 @@ class CanAmplifier(GuardedOutput):
         words = self.node.words
         return (words[ACKNOWLEDGED] - counter) & 0xFF <= (words[COUNTER] - 1 - counter) & 0xFF
 
-    def _hold_one_tick(self) -> None:
+    def _hold(self) -> None:
         """An armed node wants setpoints all the time: its own watchdog may be as short as 10 ms."""
         self._send_setpoint()
         self.poll()
-        wait_s(self._clock, TICK_S)
 
     def _fresh_status(self, timeout_s: float) -> None:
         asked_ns = self._clock.now_ns()

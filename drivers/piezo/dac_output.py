@@ -144,7 +144,7 @@ class DacOutput(GuardedOutput):
         assert pending is not None
         return pending
 
-    def arm(self) -> None:
+    def arming(self) -> Iterator[None]:
         """Self-test, ramp to neutral, verify it by readback; then ``write`` is allowed.
 
         Takes about 20 ms of bench time. Raises ``SafetyTrip`` when the readback differs.
@@ -153,7 +153,7 @@ class DacOutput(GuardedOutput):
             self.probe()
         self._position_known = False
         while not self.safe_step():
-            wait_s(self._clock, RAMP_TICK_S)
+            yield
         self.guard.armed = True
 
     def write(self, values_V: Float64Array) -> int:

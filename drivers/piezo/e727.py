@@ -94,16 +94,18 @@ class E727(GuardedOutput):
                 raise BenchError(f"the stage travels {low} .. {high} um, less than commanded", device=self.name)
         return identity
 
-    def arm(self) -> None:
+    def arming(self) -> Iterator[None]:
         """Ramp to neutral, ask for errors, compare with what the controller says it was told."""
         if not self._position_known:
             self.probe()
         self._load_kernels()
         self._position_known = False
         while not self.safe_step():
-            wait_s(self._clock, TICK_S)
+            yield
         self.link.settle()
+        yield
         self.link.command(self._command().decode().rstrip())
+        yield
         reported_V = [v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)]
         neutral = [limit.safe_V for limit in self.limits]
         good = all(abs(a - b) < 0.01 for a, b in zip(reported_V, neutral, strict=True))

@@ -20,7 +20,7 @@ from drivers.output_guard_steps import CLIPPED, SLEW_LIMITED
 from drivers.piezo import can_loop, dac_loop, e727_loop
 from drivers.piezo.e727_loop import HANDED_OVER, SENT
 from drivers.piezo.gcs import UNSENT
-from firmware_py.guardian.gate import IS_ALONE, announce, has_lease, silence_ns
+from firmware_py.guardian.gate import IS_ALONE, LEFT_NS, announce, has_lease, silence_ns
 from firmware_py.guardian.heart import BEAT, INSIDE
 from hal.compiled import kernel
 from hal.fd_kernels import full_fence
@@ -61,6 +61,7 @@ def enter(out: GatedDac) -> bool:
 def leave(out: GatedDac) -> None:
     """Do what ``LeaseGate.leave`` does."""
     if len(out.heart) > 0:
+        out.gate[LEFT_NS] = dac_loop.clock_ns(out.dac)
         full_fence()  # pyright: ignore[reportCallIssue]
         out.heart[INSIDE] = 0
 

@@ -106,6 +106,9 @@ class Micron:
         self.scans.take_none(self.run.clock.now_ns())
         return self._ticker.tick_without_scan()
 
+    def take_in(self) -> None:
+        self.scans.take_in()
+
     def look_at(self, ticks: Ticks) -> None:
         self.scans.look_at(ticks)
 

@@ -167,6 +167,9 @@ class Endoscope:
     def wait(self) -> Ticks | None:
         return self._ticker.wait()
 
+    def take_in(self) -> None:
+        pass
+
     def look_at(self, ticks: Ticks) -> None:
         if self._until_done and self.view.game.done:
             self.run.incidents.report(Finding.TARGETS_REACHED)

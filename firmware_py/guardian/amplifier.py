@@ -3,14 +3,14 @@ guardian has taken the outputs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from drivers.base import wait_s
 from drivers.piezo.dac_output import DacOutput
 from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Phase
-from hal.contracts import Clock, Float64Array
+from hal.contracts import ARMING_STEP_S, Clock, Float64Array
 from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
@@ -53,12 +53,17 @@ class GuardedAmplifier:
         return self.inner.commanded_V
 
     def arm(self) -> None:
+        """Do the steps of ``arming`` one after another."""
+        for _ in self.arming():
+            wait_s(self._clock, ARMING_STEP_S)
+
+    def arming(self) -> Iterator[None]:
         """Raises ``SafetyTrip`` when nobody would take the outputs to neutral if this process died, or when they are
         the guardian's and it does not give them back."""
-        self._require_guardian()
-        self._take_up_again()
+        yield from self._require_guardian()
+        yield from self._take_up_again()
         self._heart.say(Phase.ARMING)
-        self.inner.arm()
+        yield from self.inner.arming()
         self._heart.beat(self._clock.now_ns())
         self._heart.say(Phase.RUNNING)
 
@@ -95,7 +100,7 @@ class GuardedAmplifier:
         self.inner.close()
         self._heart.say(Phase.IDLE)
 
-    def _require_guardian(self) -> None:
+    def _require_guardian(self) -> Iterator[None]:
         """The guardian lives, and has given a sign of life just now or gives one soon."""
         heart, begin_ns = self._heart, self._clock.now_ns()
         seen_ns, now_ns = heart.watched_ns, begin_ns
@@ -103,20 +108,20 @@ class GuardedAmplifier:
             if heart.watched_ns != seen_ns or 0 < seen_ns >= now_ns - FRESH_NS:
                 self.gate.join()
                 return
-            wait_s(self._clock, STEP_S)
+            yield
             now_ns = self._clock.now_ns()
         raise SafetyTrip(
             "the outputs are not armed, because no guardian watches over them; start the run again", device=self.name
         )
 
-    def _take_up_again(self) -> None:
+    def _take_up_again(self) -> Iterator[None]:
         """After a hold: the guardian must have given the outputs back."""
         heart = self._heart
         limit_ns = self._clock.now_ns() + GIVE_BACK_NS
         while heart.taken_ns:
             if self._clock.now_ns() > limit_ns:
                 raise SafetyTrip("the guardian does not give the outputs back; start the run again", device=self.name)
-            wait_s(self._clock, STEP_S)
+            yield
         self._take_up_if_given_back()
 
     def _take_up_if_given_back(self) -> None:
@@ -127,7 +132,8 @@ class GuardedAmplifier:
     def _is_ours_again(self) -> bool:
         """After the guardian has taken the outputs: only when it has not reached neutral in time and is gone."""
         heart, now_ns = self._heart, self._clock.now_ns()
-        if heart.reached_ns:
+        # a command that was under way may have moved the outputs from neutral after the guardian had reached it
+        if heart.reached_ns and heart.confirmed_ns >= self.gate.left_ns:
             self.inner.guard.brought_to_safe_state()
             self.inner.lose_position()
             heart.ask_back(now_ns)  # before IDLE: a guardian that sees IDLE without a wish takes its leave

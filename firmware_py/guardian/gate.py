@@ -23,8 +23,9 @@ from hal.errors import LeaseLost
 
 LEASE_MARGIN_MS = 1.0
 """The guardian waits so much longer than the firmware's lease lasts."""
-LOST, IS_ALONE, LEASE_NS, LAST, WORDS = range(5)
-"""Places in ``LeaseGate.words``. ``LAST``: the three codes of the last command, 16 bits each; -1 before the first."""
+LOST, IS_ALONE, LEASE_NS, LAST, LEFT_NS, WORDS = range(6)
+"""Places in ``LeaseGate.words``. ``LAST``: the three codes of the last command, 16 bits each; -1 before the first.
+``LEFT_NS``: when the last transfer of the firmware was over, 0 before the first."""
 RUNNING = int(Phase.RUNNING)
 
 
@@ -86,7 +87,13 @@ class LeaseGate:
 
     def leave(self) -> None:
         """The transfer is over, well or not."""
+        self.words[LEFT_NS] = self._clock.now_ns()
         self.heart.leave()
+
+    @property
+    def left_ns(self) -> int:
+        """When the last transfer of the firmware was over."""
+        return self.words[LEFT_NS]
 
     @property
     def alone(self) -> bool:

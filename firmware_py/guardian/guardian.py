@@ -188,10 +188,12 @@ class Guardian:
         if now_ns < self._next_try_ns:
             return
         for _ in range(ATTEMPTS):
+            begun_ns = self._clock.now_ns()
             try:
                 if self._output.safe_step():
                     self.problem = ""
                     self._heart.reach(self._clock.now_ns())
+                    self._heart.confirm(begun_ns)
                     self.state = State.HOLDING
                 self._pause_ns = STEP_NS
             except HalError as error:
@@ -206,12 +208,14 @@ class Guardian:
             self.state = State.DONE
 
     def _hold(self, alive: bool) -> None:
+        heart, begun_ns = self._heart, self._clock.now_ns()
         with suppress(HalError):  # it has been read back once; this is for what comes after
             if self._output.verify():
+                heart.lose_neutral()
                 self._output.lose_position()
                 self._begin_ramp()
                 return
-        heart = self._heart
+            heart.confirm(begun_ns)
         if self._clock.now_ns() - heart.reached_ns <= HOLD_NS:
             return
         wanted = heart.asked_ns > heart.taken_ns

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from firmware_py.guardian.mark import MARK_BYTES, DeathMark
 
-PHASE, BEAT, _NOTICED, TAKEN, _REACHED, _WHY, INSIDE, _WATCHED, _ASKED = range(9)
+PHASE, BEAT, _NOTICED, TAKEN, _REACHED, _WHY, INSIDE, _WATCHED, _ASKED, _CONFIRMED = range(10)
 """Places in ``Heart.words``."""
 SOMEBODY, REPEATS = 1 << 48, 1 << 49
 """Bits of the word ``INSIDE`` above the three codes: a command is going out; it repeats the one before it."""
@@ -87,7 +87,7 @@ class Heart:
 
     def forget_guardian(self) -> None:
         """The guardian is gone: what it said is void. Its first ``notice`` is kept, for the run's report."""
-        for word in (TAKEN, _REACHED, _WHY, _WATCHED, _ASKED):
+        for word in (TAKEN, _REACHED, _CONFIRMED, _WHY, _WATCHED, _ASKED):
             self.words[word] = 0
 
     # -- the guardian's side
@@ -109,10 +109,18 @@ class Heart:
         """Neutral, read back."""
         self.words[_REACHED] = t_ns
 
+    def confirm(self, t_ns: int) -> None:
+        """A look at the outputs that began at ``t_ns`` found them at neutral."""
+        self.words[_CONFIRMED] = t_ns
+
+    def lose_neutral(self) -> None:
+        """The outputs are not at neutral any more."""
+        self.words[_REACHED] = self.words[_CONFIRMED] = 0
+
     def give_back(self) -> None:
         """The outputs are the firmware's again; ``taken`` is cleared last, because it is what the firmware looks at."""
         self.words[_WHY] = Why.NOTHING
-        self.words[_REACHED] = 0
+        self.lose_neutral()
         self.words[TAKEN] = 0
 
     # -- for both
@@ -152,6 +160,11 @@ class Heart:
     @property
     def reached_ns(self) -> int:
         return self.words[_REACHED]
+
+    @property
+    def confirmed_ns(self) -> int:
+        """When the guardian's newest look that found neutral began."""
+        return self.words[_CONFIRMED]
 
     @property
     def why(self) -> Why:

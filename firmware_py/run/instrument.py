@@ -78,6 +78,10 @@ class Instrument(Protocol):
         """Return the next ticks, or ``None`` where the loop must not wait any more."""
         ...
 
+    def take_in(self) -> None:
+        """Take what devices hold that keep little, without waiting; called while the outputs are being armed."""
+        ...
+
     def look_at(self, ticks: Ticks) -> None:
         """Report what the arrival of ``ticks`` reveals, before their tasks run."""
         ...

@@ -17,6 +17,7 @@ from firmware_py.run.tasks import bind_tasks
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.scheduler import Scheduler
 from firmware_py.scheduler.task import BackgroundSpec
+from hal.contracts import ARMING_STEP_S
 from hal.errors import HalError
 
 SETTLE_TICKS = 5  # covers the amplifier's own lag after the last step of the ramp
@@ -145,12 +146,19 @@ class Loop:
         run = self._run
         run.scheduler.ignore_next("arming")
         try:
-            run.supervisor.arm()
+            run.supervisor.arm(self._pass_arming_step)
         except HalError as error:
             run.incidents.report_error(Finding.OUTPUT_FAILED, self._output_name, error)
         else:
             run.armed_ns = run.clock.now_ns()
             run.end_ns = run.armed_ns + round(seconds * 1e9)
+
+    def _pass_arming_step(self) -> None:
+        """Let the time after a step of arming pass, in which devices go on sending."""
+        clock = self._run.clock
+        until_ns = clock.now_ns() + round(ARMING_STEP_S * 1e9)
+        self._instrument.take_in()
+        clock.sleep_until_ns(until_ns)
 
     @property
     def _output_name(self) -> str:
@@ -185,7 +193,7 @@ class Loop:
         run = self._run
         run.scheduler.ignore_next("arming after a hold")
         try:
-            run.supervisor.resume()
+            run.supervisor.resume(self._pass_arming_step)
         except HalError as error:
             run.incidents.report_error(finding_of_output(error), self._output_name, error)
         else:

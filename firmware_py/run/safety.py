@@ -9,6 +9,7 @@ After a latched finding it stays there, and the first reason wins. After a recov
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Literal
@@ -16,7 +17,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from firmware_py.run.findings import CauseClass, Finding
-from hal.contracts import AnalogOutput
+from hal.contracts import AnalogOutput, ArmsInSteps
 from hal.errors import HalError, I2cNack
 
 RAMP_TICKS = 20
@@ -195,10 +196,11 @@ class Supervisor:
         if self.state is State.BOOT:
             self.state = State.SENSING_ONLY
 
-    def arm(self) -> None:
-        """Arm the output (it tests itself) and allow motion. Nothing is armed after a trip."""
+    def arm(self, meanwhile: Callable[[], object] | None = None) -> None:
+        """Arm the output (it tests itself) and allow motion. Nothing is armed after a trip. ``meanwhile`` lets the time
+        after each step of ``ArmsInSteps`` pass."""
         if self.state is State.SELF_TEST:
-            self._arm_output()
+            self._arm_output(meanwhile)
 
     def hold(self, finding: Finding, reason: str, *, tick: int, t_ns: int) -> None:
         """Begin a ramp to neutral from which the run can resume. Has no effect unless the state is RUNNING."""
@@ -210,14 +212,19 @@ class Supervisor:
                 self.holds[-1].neutral_ns = t_ns
                 self.step()
 
-    def resume(self) -> None:
-        """Arm the output again (it reads neutral back) and allow motion. If arming raises, the hold continues."""
+    def resume(self, meanwhile: Callable[[], object] | None = None) -> None:
+        """Arm the output again (it reads neutral back) and allow motion. If arming raises, the hold continues.
+        ``meanwhile``: see ``arm``."""
         if self.state is State.HOLD:
-            self._arm_output()
+            self._arm_output(meanwhile)
 
-    def _arm_output(self) -> None:
-        if self._output is not None:
-            self._output.arm()
+    def _arm_output(self, meanwhile: Callable[[], object] | None) -> None:
+        output = self._output
+        if meanwhile is not None and isinstance(output, ArmsInSteps):
+            for _ in output.arming():
+                meanwhile()
+        elif output is not None:
+            output.arm()
         self.state = State.RUNNING
 
     def trip(self, finding: Finding, reason: str, *, tick: int, t_ns: int, cause: CauseClass | None = None) -> None:

@@ -106,6 +106,9 @@ def test_a_transfer_that_blocks_leaves_the_outputs_to_the_guardian(compiled: boo
     assert max([far_V(changes, neutral_s), *(far for t, far in changes if neutral_s < t < arrives_s)]) < CLOSE_V
     assert far_V(changes, arrives_s + 0.025) < CLOSE_V
     assert [hold["finding"] for hold in outcome["holds"]] == ["host_late"]
+    hold = outcome["holds"][0]
+    moved_s = max(t for t, _ in changes if t < hold["t_ns"] * 1e-9 + 0.1)
+    assert hold["t_ns"] * 1e-9 + hold["neutral_ms"] * 1e-3 >= moved_s > arrives_s
     assert outcome["safe_state"]["normal"]
 
 

@@ -6,8 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.wire import FAST_HZ, SETUPS, bench_file
+from drivers.daq.di4108 import FIFO_SAMPLES
+from firmware_py.app import run_in_process
 from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import Stages
+from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH, with_keys
@@ -44,3 +48,13 @@ def test_taps_of_another_rate_are_refused(tmp_path: Path) -> None:
         load_plan(load_bench(path))
     same = bench_at(tmp_path, 500, "feedforward = [1.2, -0.2]\ntick_hz = 500.0\n")
     assert load_plan(load_bench(same)).stages.actuation.feedforward[0] == (1.2, -0.2)
+
+
+def test_scans_are_taken_in_while_a_slow_output_is_armed(tmp_path: Path) -> None:
+    """An E-727 is armed for 39 ms; the DAQ holds the scans of 32 ms at 4 kHz."""
+    bench = bench_file(next(setup for setup in SETUPS if setup.tick_hz == FAST_HZ), tmp_path)
+    outcome, _ = run_in_process(RunRequest(bench, 0.05, pace="virtual"))
+    assert outcome["ticks"]["announced"]["arming"]["caught_up"] > FIFO_SAMPLES // 8
+    assert outcome["holds"] == []
+    assert outcome["samples"]["lost"] == 0
+    assert outcome["safe_state"]["normal"]

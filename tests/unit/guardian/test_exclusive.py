@@ -244,6 +244,28 @@ def test_outputs_do_not_wait_for_ever_and_the_report_says_so():
     assert not stand.guardian.report()["exclusive"]
 
 
+def test_neutral_that_a_late_command_has_left_is_not_told():
+    """The guardian was at neutral while the command was under way: what counts is that it finds the outputs there
+    again."""
+    stand = Stand()
+    stand.run(5, alternating)
+    stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.4))
+    stand.amplifier.write(FAR_V)
+    stand.slow.arm(FaultPlan())
+    arrived_ns = stand.clock.now_ns()
+    assert stand.heart.reached_ns < arrived_ns
+    assert stand.volts() != pytest.approx([50.0] * 3)
+    while not stand.amplifier.safe_step():
+        stand.tick()
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    told_ns = stand.clock.now_ns()
+    assert arrived_ns < stand.guardian.report()["neutral_ns"] <= told_ns
+    assert stand.commands_of("firmware")[-1] <= arrived_ns
+    for _ in range(70):
+        stand.tick()
+    assert max(t_ns for t_ns, _, _ in stand.path) <= told_ns
+
+
 def test_a_command_that_has_arrived_is_no_reason_to_end_anybody():
     ended: list[int] = []
     stand = Stand(end=lambda: ended.append(1))
