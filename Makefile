@@ -93,15 +93,21 @@ wheel: setup
 # command's help, which reach the commands, and diagnoses of whole recordings, which reach the mismatch engine
 CORES ?= 2
 SLOW = tests/unit/cli/test_worked_examples.py tests/unit/mismatch_engine
-FOLDERS = $(filter-out tests/perf,$(patsubst %/,%,$(sort $(dir $(wildcard tests/*/test_*.py tests/unit/*/test_*.py)))))
+FOLDERS = $(filter-out tests/perf tests/examples/%,$(patsubst %/,%,$(sort $(dir $(wildcard tests/*/test_*.py tests/*/*/test_*.py)))))
 MEASURED = $(FOLDERS:%=out/coverage/%.data) $(SLOW:%=out/coverage/slow/%.data)
 SOURCES = $(shell git ls-files '*.py')
 out/coverage/slow/%.data: MARK = slow
 out/coverage/%.data: MARK = not slow and not realtime
-out/coverage/slow/%.data out/coverage/%.data: $(SOURCES)
-	mkdir -p $(@D) && rm -f $@.part
-	COVERAGE_FILE=$@.part $(BIN)/pytest -q -m "$(MARK)" $* --cov --cov-report= --cov-fail-under=0 || [ $$? -eq 5 ]
-	if [ -e $@.part ]; then mv $@.part $@; else touch $@; fi
+define measure
+mkdir -p $(@D) && rm -f $@.part
+COVERAGE_FILE=$@.part $(BIN)/pytest -q -m "$(MARK)" $* --cov --cov-report= --cov-fail-under=0 || [ $$? -eq 5 ]
+if [ -e $@.part ]; then mv $@.part $@; else touch $@; fi
+endef
+# two rules: one rule of two patterns would take the slow tests of a folder for done with its others
+out/coverage/slow/%.data: $(SOURCES)
+	$(measure)
+out/coverage/%.data: $(SOURCES)
+	$(measure)
 coverage: setup quality
 	$(MAKE) -j $(CORES) $(MEASURED)
 	$(BIN)/coverage combine -q --keep --data-file=out/coverage/all $$(find out/coverage -name '*.data' -size +0)

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console, RenderableType
 from rich.progress import TextColumn
 from rich.status import Status
+from rich.table import Column, Table
 from rich.text import Text
 
 
@@ -34,6 +35,18 @@ class PlainConsole(Console):
 def plain_console(**options: Any) -> Console:
     """A console without markup, emoji codes and highlighting; ``options`` as for ``rich.console.Console``."""
     return PlainConsole(markup=False, emoji=False, highlight=False, **options)
+
+
+def table_of(title: str | None, *headings: str, left: int = 1, no_wrap: bool = False, **options: Any) -> Table:
+    """A table whose first ``left`` columns are text and whose others are numbers, to the right.
+
+    Text that is too long for its column is folded. ``options`` as for ``rich.table.Table``.
+    """
+    columns = (
+        Column(heading, justify="left" if i < left else "right", overflow="fold", no_wrap=no_wrap)
+        for i, heading in enumerate(headings)
+    )
+    return Table(*columns, title=title, title_justify="left", **options)
 
 
 def task_name() -> TextColumn:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
 from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.output import check_writable, write_calibration, write_json
+from tools.terminal import table_of
 
 calibrate = typer.Typer(help="Identify sensors and stacks from calibration recordings.")
 
@@ -54,18 +54,10 @@ def sensors(
         write_calibration(
             out, calibration_toml("sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
         )
-        table = Table(
-            title=f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %",
-            title_justify="left",
-        )
-        for column in (
-            "axis",
-            "bias (V)",
-            "scale (V/g)",
-            "bias with in-plane, out-of-plane (mg/g^2)",
-            "rms: line, model, left out (mV)",
-        ):
-            table.add_column(column, justify="right")
+        table = table_of(
+            f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %", "axis", "bias (V)",
+            "scale (V/g)", "bias with in-plane, out-of-plane (mg/g^2)", "rms: line, model, left out (mV)", left=0,
+        )  # fmt: skip
         for name, axis in zip(SENSORS, result.accelerometers.axes, strict=True):
             cross = [axis.parameters[key] for key in ("in_plane_2", "out_of_plane_2")]
             bias = axis.parameters["bias_V"]

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_calibration, write_json
+from tools.terminal import table_of
 
 if TYPE_CHECKING:
     from tools.calibrate.piezo_feedforward import Feedforward
@@ -96,13 +96,9 @@ def _json(fit: PiezoFit, prediction: Prediction) -> dict[str, object]:
 def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforward) -> None:
     import numpy as np
 
-    table = Table(title="Piezo stacks; errors on recordings that the fit had not seen", title_justify="left")
-    for heading in ("", *(f"stack {i + 1}" for i in range(len(fits)))):
-        table.add_column(heading, justify="right" if heading else "left")
-
-    def row(name: str, *cells: str) -> None:
-        table.add_row(name, *cells)
-
+    stacks = (f"stack {i + 1}" for i in range(len(fits)))
+    table = table_of("Piezo stacks; errors on recordings that the fit had not seen", "", *stacks)
+    row = table.add_row
     row("displacement (um)", *(f"{f.range_um:.2f}" for f in fits))
     row("best line, rms (um)", *(f"{f.linear_rms_um:.3f}" for f in fits))
     row("model, rms (um)", *(f"{f.held_out_rms_um:.3f}" for f in fits))
@@ -165,9 +161,8 @@ def manipulator(
         check_writable(json_file, out)
         fit = identify_manipulator(load_scan(recording))
         write_calibration(out, manipulator_calibration(fit, f"manipulator from {recording.name}"))
-        table = Table(title=f"{fit.positions} positions, condition {fit.condition:.0f}", title_justify="left")
-        for heading in ("parameter", "value", "95 % interval"):
-            table.add_column(heading, justify="left" if heading == "parameter" else "right")
+        title = f"{fit.positions} positions, condition {fit.condition:.0f}"
+        table = table_of(title, "parameter", "value", "95 % interval")
         for name, e in fit.parameters.items():
             table.add_row(name, f"{e.value:.4f}", f"{e.low:.4f} .. {e.high:.4f}")
         data_console().print(table)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from hal.types import STANDARD_GRAVITY
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_calibration, write_json
+from tools.terminal import table_of
 
 
 class Method(StrEnum):
@@ -54,9 +54,7 @@ def three(columns: str) -> tuple[str, str, str]:
 def print_parameters(title: str, parameters: dict, notes: list[str], json_file: str | None) -> None:
     """A table of estimates with their intervals, and lines below it; beside JSON on standard output, on the other."""
     to = console() if json_file == "-" else data_console()
-    table = Table(title=title, title_justify="left")
-    for heading in ("parameter", "value", "95 % interval"):
-        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    table = table_of(title, "parameter", "value", "95 % interval")
     for name, e in parameters.items():
         table.add_row(name, f"{e.value:.6g}", f"{e.low:.6g} .. {e.high:.6g}")
     to.print(table)

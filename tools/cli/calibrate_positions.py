@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from tools.cli.bench_option import bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.output import check_writable, write_calibration, write_json
+from tools.terminal import table_of
 
 
 def positions(
@@ -49,13 +49,11 @@ def positions(
         readings, field = instrument_readings(log, config)
         with console().status("fitting the swing"):
             fit = fit_positions(readings, field, log.need_rate(), config)
-        table = Table(
-            title=f"{fit.seconds:.0f} s, {fit.turning_rad_s:.2f} rad/s rms, condition {fit.condition:.0f}, residual "
+        table = table_of(
+            f"{fit.seconds:.0f} s, {fit.turning_rad_s:.2f} rad/s rms, condition {fit.condition:.0f}, residual "
             f"{1e3 * fit.residual_m_s2:.2f} mm/s^2; intervals of 95 %",
-            title_justify="left",
-        )
-        for heading in ("place", "believed (mm)", "found (mm)", "moved by (mm)"):
-            table.add_column(heading, justify="left" if heading == "place" else "right")
+            "place", "believed (mm)", "found (mm)", "moved by (mm)",
+        )  # fmt: skip
         for name, before, place, reach in zip(fit.names, fit.believed, fit.places, fit.reach, strict=True):
             table.add_row(
                 name,

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from hal.bench import load_bench
@@ -18,6 +17,7 @@ from tools.cli.common import Exit, JsonOption, clear_errors, console, data_conso
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
+from tools.terminal import table_of
 
 YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
 
@@ -71,16 +71,12 @@ def scan(
             result = scan_bench(opened, probe.value, seconds, lambda text: console().print(text, style="dim"))
         out = data_console()
         out.print("ports of this machine: " + (", ".join(result.ports) or "none"))
-        table = Table(title="I2C", title_justify="left")
-        for heading in ("bus", "address", "declared", "answers"):
-            table.add_column(heading)
+        table = table_of("I2C", "bus", "address", "declared", "answers", left=4)
         for a in result.i2c:
             answered = Text("yes") if a.answered else Text("no", "bold red")
             table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", answered)
         out.print(table)
-        traffic = Table(title=f"CAN, {seconds:g} s", title_justify="left")
-        for heading in ("bus", "id", "message", "frames", "rate (Hz)"):
-            traffic.add_column(heading)
+        traffic = table_of(f"CAN, {seconds:g} s", "bus", "id", "message", "frames", "rate (Hz)", left=5)
         for c in result.can:
             traffic.add_row(c.bus, f"0x{c.can_id:03X}", c.name, str(c.frames), f"{c.rate_hz:.1f}")
         out.print(traffic)
@@ -232,9 +228,7 @@ def ramp(
         channels = [c - 1 for c in channel or [1, 2, 3]]
         if max(channels) > 2:
             raise InputError(f"--channel {max(channels) + 1}: this instrument has outputs 1 to 3")
-        table = Table(title="Staircase", title_justify="left")
-        for heading in ("output", "wanted (V)", "read back (V)", "error (mV)"):
-            table.add_column(heading, justify="right")
+        table = table_of("Staircase", "output", "wanted (V)", "read back (V)", "error (mV)", left=0)
 
         def show(step: RampStep) -> None:
             bad = abs(step.error_V) > tolerance_V
@@ -355,9 +349,8 @@ def _replay_transcript(folder: Path, bench: Path | None, json_file: str | None) 
     from tools.diagnose.golden import diff
 
     report = diff(folder, None if bench is None else bench_path(bench))
-    table = Table(title=f"{report.compared} transfers", title_justify="left")
-    for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
-        table.add_column(heading)
+    headings = ("bus", "against", "entry", "kind", "recorded", "now")
+    table = table_of(f"{report.compared} transfers", *headings, left=6)
     for d in report.differences:
         table.add_row(d.bus, d.side, str(d.entry), d.kind, d.recorded, d.found)
     if report.differences:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from firmware_py.machine.settings import set_machine
@@ -19,6 +18,7 @@ from tools.cli.common import Exit, JsonOption, clear_errors, console, data_conso
 from tools.diagnose.findings import bench_findings, machine_findings, setting_findings
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.terminal import table_of
 
 
 def doctor(
@@ -50,9 +50,7 @@ def doctor(
         findings = machine_findings() + setting_findings(tree, ports) + bench_findings(file)
         missing = [f for f in findings if f.verdict == "missing"]
         if json_file != "-":
-            table = Table(title="micron doctor", title_justify="left")
-            for column in ("part", "verdict", "found", "what to do"):
-                table.add_column(column, overflow="fold")
+            table = table_of("micron doctor", "part", "verdict", "found", "what to do", left=4)
             colours = {"ok": "green", "limited": "yellow", "missing": "red"}
             for finding in findings:
                 colour = colours[finding.verdict]

@@ -9,13 +9,13 @@ import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from hal.bench import load_bench
 from tools.cli.bench_option import bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.terminal import table_of
 
 if TYPE_CHECKING:
     from tools.emulate.world import Served
@@ -82,9 +82,7 @@ def emulate(
 
 
 def _print(served: Served) -> None:
-    table = Table(box=None, pad_edge=False)
-    for heading in ("bus", "kind", "parts", "where"):
-        table.add_column(heading, overflow="fold")
+    table = table_of(None, "bus", "kind", "parts", "where", left=4, box=None, pad_edge=False)
     for bus in served.buses:
         table.add_row(bus.name, bus.kind, ", ".join(bus.parts), "\n".join(bus.places))
     out = data_console()

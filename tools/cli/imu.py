@@ -9,14 +9,13 @@ from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, Progress, TimeRemainingColumn
-from rich.table import Table
 
 from tools.cli.bench_option import bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
-from tools.terminal import task_name
+from tools.terminal import table_of, task_name
 
 
 def imu(
@@ -157,11 +156,7 @@ def _show(report: dict[str, Any]) -> None:
     title = (
         f"{report['sensor']}: {report['seconds']:.0f} s at {report['rate_hz']:g} Hz, |a| = {report['gravity_g']:.4f} g"
     )
-    table = Table(title=title, title_justify="left")
-    table.add_column("Erat 2018")
-    table.add_column("quantity")
-    for axis in AXES:
-        table.add_column(axis, justify="right")
+    table = table_of(title, "Erat 2018", "quantity", *AXES, left=2)
 
     def row(source: str, what: str, values: dict[str, float] | None, form: str) -> None:
         if values is not None:
@@ -185,9 +180,9 @@ def _show(report: dict[str, Any]) -> None:
         )
     warm = report["thermal"]
     if warm is not None:
-        table = Table(title=f"temperature {warm['lowest_C']:.1f} .. {warm['highest_C']:.1f} degC", title_justify="left")
-        for column in ("axis", "slope per K", "change", "rms before", "rms after", "unit", "verdict"):
-            table.add_column(column, justify="right")
+        title = f"temperature {warm['lowest_C']:.1f} .. {warm['highest_C']:.1f} degC"
+        headings = ("axis", "slope per K", "change", "rms before", "rms after", "unit", "verdict")
+        table = table_of(title, *headings, left=0)
         for name, axis in warm["axes"].items():
             figures = (axis["slope_per_K"], axis["change"], axis["rms_before"], axis["rms_after"])
             table.add_row(name, *(f"{v:.3g}" for v in figures), axis["unit"], axis["verdict"])

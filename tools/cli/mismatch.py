@@ -18,7 +18,7 @@ from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import Outputs, check_folder, check_names, check_writable, write_json, write_text_atomic
-from tools.terminal import task_name
+from tools.terminal import table_of, task_name
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -228,11 +228,8 @@ def new(
 
 
 def _show_new(made: NewRecording, json_file: str | None) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False)
-    for heading in ("column", "role", "signal", "unit", "from", "to"):
-        table.add_column(heading, overflow="fold")
+    headings = ("column", "role", "signal", "unit", "from", "to")
+    table = table_of(None, *headings, left=6, box=None, pad_edge=False)
     for c in made.guess.columns:
         signal = c.signal if c.role in ("input", "output", "context") else ""
         table.add_row(c.name, c.role or "not used", signal, c.unit or "?", f"{min(c.low):.4g}", f"{max(c.high):.4g}")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rich.table import Table
-
 from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
 from tools.cli.common import JsonOption, clear_errors, data_console
 from tools.output import check_writable, write_json
+from tools.terminal import table_of
 
 
 def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: JsonOption = None) -> None:
@@ -22,9 +21,7 @@ def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: J
         with opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened:
             values = read_sensors(opened)
         if json_file != "-":
-            table = Table()
-            for heading in ("device", "identity", "quantity", "value", "unit"):
-                table.add_column(heading, overflow="fold")
+            table = table_of(None, "device", "identity", "quantity", "value", "unit", left=5)
             for v in values:
                 table.add_row(v.device, v.identity, v.quantity, f"{v.value:.6g}", v.unit)
             data_console().print(table)

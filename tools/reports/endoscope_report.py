@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from tools.terminal import table_of
+
 
 def inclination_errors_deg(rows: NDArray[np.float64], truth: Mapping[str, Any]) -> NDArray[np.float64]:
     """(n,) angle between estimated and true up for rows (n, 5) of time in ns and quaternion; nan beyond the truth."""
@@ -50,12 +52,10 @@ def complete_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None) -> di
 
 def print_run(result: dict[str, Any], console: Console) -> None:
     """Print the report for people."""
-    table = Table(
-        title=f"{result['bench']}: {result['ran_s']:.1f} s, {result['clock']} time, steered by {result['steered_by']}",
-        title_justify="left",
-    )
-    for column in ("sensor", "received", "lost", "masked", "bad frames", "up rms (deg)", "up max (deg)"):
-        table.add_column(column, justify="left" if column == "sensor" else "right")
+    table = table_of(
+        f"{result['bench']}: {result['ran_s']:.1f} s, {result['clock']} time, steered by {result['steered_by']}",
+        "sensor", "received", "lost", "masked", "bad frames", "up rms (deg)", "up max (deg)",
+    )  # fmt: skip
     for name, s in result["sensors"].items():
         error = result["attitude"][name]
         figures = (error["inclination_rms_deg"], error["inclination_max_deg"])
@@ -74,12 +74,8 @@ def print_run(result: dict[str, Any], console: Console) -> None:
 
 def status_table(status: dict[str, Any], seconds: float) -> Table:
     """A few numbers while it runs."""
-    table = Table(
-        title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}, {status['mode']}]",
-        title_justify="left",
-    )
-    for column in ("", "", "", ""):
-        table.add_column(column, justify="right")
+    title = f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}, {status['mode']}]"
+    table = table_of(title, "", "", "", "", left=0)
     table.add_row("roll, pitch, yaw (deg)", *(f"{v:.1f}" for v in status["angles_deg"]))
     table.add_row("view x, y, side (px)", *(f"{v:.0f}" for v in status["view"]))
     table.add_row("targets, lost, ticks skipped", str(status["reached"]), str(status["lost"]), str(status["skipped"]))

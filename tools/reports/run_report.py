@@ -17,6 +17,7 @@ from rich.text import Text
 
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
 from tools.reports.figures import AXES, FOUR_BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, band_name, band_pass, density_text
+from tools.terminal import table_of
 
 Array = NDArray[np.float64]
 NOTHING_UM = 0.2
@@ -51,12 +52,15 @@ def _compared(without_um: float | None, with_um: float | None) -> str:
     return f"{change:.0f} % less" if change >= 0.0 else f"{-change:.0f} % more"
 
 
+_CLOSE: dict[str, Any] = {"box": None, "padding": (0, 1, 0, 0), "pad_edge": False}
+"""How a table with many columns is set."""
+
+
 def tremor_table(result: Mapping[str, Any]) -> Table:
     """Return a table of the tremor without and with compensation, per axis and as a vector, and of the tip's error in
     each band."""
-    table = Table(title="Motion of the tip, um rms (physical truth)", title_justify="left", box=box.SIMPLE_HEAD)
-    for column in ("", "without", "with", "compensation"):
-        table.add_column(column, justify="left" if not column else "right")
+    title = "Motion of the tip, um rms (physical truth)"
+    table = table_of(title, "", "without", "with", "compensation", box=box.SIMPLE_HEAD)
 
     def add(name: str, without_um: float | None, with_um: float | None) -> None:
         figures = (_number(v, "{:.2f}") for v in (without_um, with_um))
@@ -75,13 +79,9 @@ def tremor_table(result: Mapping[str, Any]) -> Table:
 def spectrum_table(result: Mapping[str, Any]) -> Table:
     """Return a table of the spectrum of the tip's error, without and with compensation, at ``SHOWN_HZ``."""
     spectrum = result["tremor"]["spectrum"]
-    table = Table(
-        title="Spectrum of the tip's error of path, um/sqrt(Hz)", title_justify="left",
-        box=None, padding=(0, 1, 0, 0), pad_edge=False,
-    )  # fmt: skip
     at = [n for n, hz in enumerate(spectrum["hz"]) if hz in SHOWN_HZ]
-    for column in ("Hz", *(f"{spectrum['hz'][n]:g}" for n in at)):
-        table.add_column(column, justify="left" if column == "Hz" else "right", no_wrap=True)
+    headings = ("Hz", *(f"{spectrum['hz'][n]:g}" for n in at))
+    table = table_of("Spectrum of the tip's error of path, um/sqrt(Hz)", *headings, no_wrap=True, **_CLOSE)
     for name in ("without", "with"):
         table.add_row(name, *(density_text(spectrum[f"{name}_um_rtHz"][n]) for n in at))
     return table
@@ -90,14 +90,10 @@ def spectrum_table(result: Mapping[str, Any]) -> Table:
 def task_table(result: Mapping[str, Any]) -> Table:
     """Every task's time and CPU time against its budget, in us; fits eighty columns."""
     time = "wall" if result.get("clock") == "real" else "emulated"
-    table = Table(
-        title=f"Tasks: {time} time and host CPU time of a run, us", title_justify="left",
-        box=None, padding=(0, 1, 0, 0), pad_edge=False,
-    )  # fmt: skip
     short = time[:4]
     figures = (f"{short}\np50", f"{short}\np99", f"{short}\nmax", "CPU\np50", "CPU\np99", "bud-\nget")
-    for column in ("\ntask", "\nHz", "\nruns", *figures, "runs\nover", "put\noff"):
-        table.add_column(column, justify="left" if "task" in column else "right", no_wrap=True)
+    headings = ("\ntask", "\nHz", "\nruns", *figures, "runs\nover", "put\noff")
+    table = table_of(f"Tasks: {time} time and host CPU time of a run, us", *headings, no_wrap=True, **_CLOSE)
     for name, task in result["tasks"].items():
         duration, cpu = task["duration_us"], task["cpu_us"]
         table.add_row(

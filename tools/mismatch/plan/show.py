@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.table import Table
 
 from tools.mismatch.plan.plan import Designed, Prospect, words
 from tools.mismatch.plan.separable import THRESHOLD
+from tools.terminal import table_of
 
 
 def print_prospect(p: Prospect, say: Console) -> None:
@@ -21,9 +21,8 @@ def print_prospect(p: Prospect, say: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    table = Table(title=f"smallest effect that shows ({THRESHOLD:g} sd)", title_justify="left", box=None)
-    for heading in ("effect", "at", f"rms ({unit})"):
-        table.add_column(heading, justify="right" if heading.startswith("rms") else "left")
+    title = f"smallest effect that shows ({THRESHOLD:g} sd)"
+    table = table_of(title, "effect", "at", f"rms ({unit})", left=2, box=None)
     for s in p.found.visible:
         table.add_row(words((s.name,)), s.place, f"{s.smallest_rms * noise:.3g}")
     say.print(table)
