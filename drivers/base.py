@@ -8,7 +8,7 @@ from hal.contracts import Clock
 
 
 class DigitalOutput(Protocol):
-    """A few switch outputs, all set at once: bit i is output i."""
+    """Defines a few switch outputs that are set at once: bit i is output i."""
 
     def write_digital(self, bits: int) -> None: ...
 

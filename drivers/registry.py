@@ -53,7 +53,7 @@ Input = Callable[[int], float]
 
 
 class Sensor(Protocol):
-    """The object that a driver of role "sensor" opens. It sends nothing on the bus before ``probe``."""
+    """Defines the object that a driver of role "sensor" opens. It sends nothing on the bus before ``probe``."""
 
     def probe(self) -> str:
         """Return the identity of the device; raises ``WrongDevice`` if another device answers.

@@ -59,7 +59,7 @@ class I2cSpec(_Strict):
 
 
 class CanSpec(_Strict):
-    """A CAN bus with classic frames."""
+    """Describes a CAN bus with classic frames."""
 
     kind: Literal["can"]
     uri: str
@@ -206,11 +206,10 @@ def _duplicates(claims: Iterable[tuple[tuple[str | None, int | None], str]]) -> 
 
 
 class EmulatedWorld(Protocol):
-    """The object that an emulation provider returns. It holds the far ends of the ``sim://`` buses and the physical
-    truth."""
+    """Defines the object that an emulation provider returns: far ends of ``sim://`` buses and physical truth."""
 
     def endpoint(self, bus: str) -> str | Port:
-        """A URI for the ordinary adapters (own process, real time) or a port object (virtual time)."""
+        """Return a URI for the ordinary adapters (own process, real time) or a port object (virtual time)."""
         ...
 
     def alive(self) -> bool: ...
@@ -235,7 +234,7 @@ Provider = Callable[..., EmulatedWorld]
 
 @dataclass
 class Processes:
-    """State of the simulated processes of a bench in virtual time, where all of them run in one process.
+    """Holds the state of the simulated processes of a bench in virtual time, where all of them run in one process.
 
     ``dead`` names those that a fault test has killed: "firmware", "guardian" (until another one is started) and "new
     guardians". ``guardian_report`` returns what the guardian reports."""

@@ -46,7 +46,7 @@ class SerialPort(Protocol):
         ...
 
     def drain_input(self) -> int:
-        """Throw away what has arrived; return how many bytes that was."""
+        """Discard the bytes that have arrived. Return their number."""
         ...
 
     def info(self) -> PortInfo: ...
@@ -171,7 +171,7 @@ class AnalogOutput(Protocol):
 
 @runtime_checkable
 class BuffersScans(Protocol):
-    """An ``AnalogInputScan`` whose device keeps few scans, and whose driver can keep more."""
+    """Defines an ``AnalogInputScan`` whose device keeps few scans, and whose driver can keep more."""
 
     def take_in(self) -> None:
         """Take what the device holds into the driver's memory, without waiting; ``read_scans`` delivers it and says
@@ -185,7 +185,7 @@ ARMING_STEP_S = 0.001
 
 @runtime_checkable
 class ArmsInSteps(Protocol):
-    """An analog output whose arming leaves its caller free to do something else in between."""
+    """Defines an analog output whose arming leaves its caller free to do something else in between."""
 
     def arming(self) -> Iterator[None]:
         """Do what ``arm`` does; after each step the caller lets ``ARMING_STEP_S`` pass. An output is not armed before

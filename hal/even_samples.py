@@ -47,7 +47,7 @@ def steady_stamps(stamps_s: Array) -> Array:
 
 
 def evenly(stamps_s: Array, values: Array, judge: Array | None = None) -> tuple[Array, float, float, tuple[str, ...]]:
-    """``values`` (n, k) on an even time base: samples, rate, time of the first, what was done.
+    """Return ``values`` (n, k) on an even time base: samples, rate, time of the first, and notes on what was done.
 
     The longest stretch without a gap is used. ``judge`` (n, j), default ``values``, is the signal by which the stamps
     are believed or taken as jitter of the transport (``stamp_share``). Raises ValueError for stamps that run backwards,

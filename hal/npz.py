@@ -72,7 +72,7 @@ class Npz:
 
 
 def _fill(file: Any, array: NDArray[Any], name: str) -> None:
-    """Straight into the array, a part at a time: ``ZipExtFile.read`` of all would copy what it has for every part."""
+    """Read into the array, a part at a time: ``ZipExtFile.read`` of all would copy what it has for every part."""
     raw = array.reshape(-1, order="A").view(np.uint8).data if array.size else memoryview(b"")
     at = 0
     while at < len(raw):

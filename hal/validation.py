@@ -34,7 +34,7 @@ def describe_validation_error(error: ValidationError, where: str) -> str:
 
 
 def validate_table(model: type[_Model], table: Mapping[str, Any], where: str) -> _Model:
-    """``model`` from ``table``, with a ``BenchError`` that names file and key when that is impossible."""
+    """Return ``table`` as ``model``. Raises a ``BenchError`` that names file and key when that is impossible."""
     try:
         return model.model_validate(dict(table))
     except ValidationError as error:

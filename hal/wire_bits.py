@@ -22,5 +22,5 @@ def serial_bits(n_bytes: int) -> int:
 
 
 def can_bits(n_data: int) -> int:
-    """Largest number of bits of a classic base frame with ``n_data`` bytes, with interframe space and stuff bits."""
+    """Return the largest number of bits of a classic base frame with ``n_data`` bytes, stuff bits included."""
     return 47 + 8 * n_data + (34 + 8 * n_data - 1) // 4

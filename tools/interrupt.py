@@ -51,7 +51,7 @@ def keep_what_is_there() -> Iterator[None]:
 
 @contextmanager
 def begin_command() -> Iterator[None]:
-    """Remember a stop until the block ends, and no longer: who calls two commands stops one of them."""
+    """Remember Ctrl-C until the block ends: of two commands in one process it stops the one that runs."""
     before = _STOPPED.set(False)
     try:
         yield

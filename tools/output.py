@@ -1,4 +1,4 @@
-"""Results as files: each is there whole or not at all, none costs another one, and names are checked beforehand."""
+"""Writes results as files: each is there whole or not at all, none costs another, and names are checked before."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def save_figure(figure: Any, path: Path, **options: Any) -> None:
 
 
 def make_folder_of(path: Path) -> None:
-    """``OutputError`` when the folder of ``path`` is not there and cannot be made."""
+    """Make the folder of ``path`` unless it is there. Raises ``OutputError`` if it cannot be made."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,7 +111,7 @@ class Outputs:
             self.failed.append(f"{name}: {type(error).__name__}: {error}")
 
     def finish(self) -> None:
-        """``OutputError`` with everything that failed."""
+        """Raise ``OutputError`` with everything that failed, if anything did."""
         if self.failed:
             raise OutputError("not all results could be written; the others are there\n  " + "\n  ".join(self.failed))
 

@@ -1,4 +1,4 @@
-"""Compiling for the first run on a machine: two processes at a time, with a progress bar.
+"""Compiles for the first run on a machine: two processes at a time, with a progress bar.
 
 Kernels are kept on disk (``hal.compiled``), so this happens once per version and machine. A marker beside them, named
 after the sources that they come from, says that it has been done.

@@ -20,7 +20,7 @@ MOST_FILES = 1000
 
 @dataclass(frozen=True)
 class Program:
-    """A program that ``named_by`` names: a ``file``, or the object ``target`` of an installed package."""
+    """Describes a program that ``named_by`` names: a ``file``, or the object ``target`` of an installed package."""
 
     named_by: Path
     file: Path | None = None
@@ -46,7 +46,7 @@ class Program:
 
 @dataclass(frozen=True)
 class OutsideFile:
-    """A file that ``named_by`` names and that lies outside its folder."""
+    """Describes a file that ``named_by`` names and that lies outside its folder."""
 
     named_by: Path
     file: Path

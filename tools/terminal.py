@@ -17,7 +17,7 @@ from rich.text import Text
 
 
 class PlainStatus(Status):
-    """A spinner with a text that may change."""
+    """Shows a spinner with a text that may change."""
 
     def update(self, status: RenderableType | None = None, **options: Any) -> None:
         """Show ``status``; ``options`` as for ``rich.status.Status.update``."""
@@ -28,17 +28,17 @@ class PlainConsole(Console):
     """See ``plain_console``."""
 
     def status(self, status: RenderableType, **options: Any) -> PlainStatus:
-        """A spinner beside ``status``, as ``rich.console.Console.status``."""
+        """Return a spinner beside ``status``, as ``rich.console.Console.status`` does."""
         return PlainStatus(_plain(status) or "", console=self, **options)
 
 
 def plain_console(**options: Any) -> Console:
-    """A console without markup, emoji codes and highlighting; ``options`` as for ``rich.console.Console``."""
+    """Return a console without markup, emoji codes and highlighting; ``options`` as for ``rich.console.Console``."""
     return PlainConsole(markup=False, emoji=False, highlight=False, **options)
 
 
 def table_of(title: str | None, *headings: str, left: int = 1, no_wrap: bool = False, **options: Any) -> Table:
-    """A table whose first ``left`` columns are text and whose others are numbers, to the right.
+    """Return a table whose first ``left`` columns are text and whose others are numbers, to the right.
 
     Text that is too long for its column is folded. ``options`` as for ``rich.table.Table``.
     """
@@ -50,7 +50,7 @@ def table_of(title: str | None, *headings: str, left: int = 1, no_wrap: bool = F
 
 
 def task_name() -> TextColumn:
-    """The column of a progress display that names the task, as plain text."""
+    """Return the column of a progress display that names the task, as plain text."""
     return TextColumn("{task.description}", markup=False)
 
 

@@ -1,4 +1,4 @@
-"""A table as TOML that a person reads: one key a line, vectors on a line, floats as exact as they are in memory."""
+"""Writes a table as TOML that a person reads: one key a line, vectors on a line, floats exact as in memory."""
 
 from __future__ import annotations
 

@@ -9,41 +9,35 @@ Units: drive V, stroke m (slopes m/V), rate m/s; dead-zone thresholds in m.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.actuation.config import StackConfig
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
 UM = 1e-6
 
 
-def operator_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
-    """Numbers of one stack."""
-    return np.dtype(
-        [
-            ("centre_V", "f8"),  # the plays see the drive less this
-            ("level", "f8"),  # and their sum counts from here, m
-            ("r", "f8", (n_plays,)),
-            ("slope", "f8", (n_plays,)),  # W_i, partial sums of the weights, m/V
-            ("slope_per_rate", "f8", (n_plays,)),  # c_i, m/V per m/s
-            ("rate_high", "f8", (n_plays,)),  # the law is held beyond, m/s
-            ("rate_low", "f8"),  # and below
-            ("least_slope", "f8"),
-            ("d", "f8", (n_zones,)),
-            ("s", "f8", (n_zones,)),
-            ("d_inverse", "f8", (n_zones,)),
-            ("s_inverse", "f8", (n_zones,)),
-            ("offset", "f8"),
-            ("creep_share", "f8", (n_creep,)),
-            ("creep_keep", "f8", (n_creep,)),  # of one tick
-            ("creep_reference", "f8"),  # stroke without creep at which it rests, m
-        ]
-    )
+@record
+class Operator:
+    """The numbers of one stack."""
+
+    centre_V: float = field("V")  # the plays see the drive less this
+    level: float = field("m")  # and their sum counts from here
+    r: Array = field("V", "plays")
+    slope: Array = field("m/V", "plays")  # W_i, partial sums of the weights
+    slope_per_rate: Array = field("s/V", "plays")  # c_i
+    rate_high: Array = field("m/s", "plays")  # the law is held beyond
+    rate_low: float = field("m/s")  # and below
+    least_slope: float = field("m/V")
+    d: Array = field("m", "zones")
+    s: Array = field("1", "zones")
+    d_inverse: Array = field("m", "zones")
+    s_inverse: Array = field("1", "zones")
+    offset: float = field("m")
+    creep_share: Array = field("1", "creep")
+    creep_keep: Array = field("1", "creep")  # of one tick
+    creep_reference: float = field("m")  # stroke without creep at which it rests
 
 
 def inverse_weights(w: Array) -> Array:
@@ -57,7 +51,7 @@ def inverse_thresholds(r: Array, w: Array) -> Array:
     return np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
 
 
-def plays_at(stack: Record, drive_V: float, high_V: float) -> Array:
+def plays_at(stack: Operator, drive_V: float, high_V: float) -> Array:
     """Play states of a stack that was cycled over its range (0, ``high_V``, 0) and then driven up to ``drive_V``."""
     down = np.maximum(-stack.r, np.minimum(stack.r, np.maximum(high_V - stack.r, 0.0)))
     return np.maximum(drive_V - stack.r, down) - stack.centre_V
@@ -85,8 +79,10 @@ def _fill(values: tuple[float, ...], n: int, rest: float, step: float = 0.0) -> 
     return filled
 
 
-def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[int, int, int] | None = None) -> Record:
-    """The kernels' numbers of one stack (dtype ``operator_dtype``), filled up to ``sizes``."""
+def operator_params(
+    stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[int, int, int] | None = None
+) -> Records[Operator]:
+    """Return the kernels' numbers of one stack, filled up to ``sizes``."""
     plays, zones, creep = sizes or sizes_of(stack)
     r = _fill(stack.play_thresholds_V, plays, stack.play_thresholds_V[-1] + 1.0, 1.0)
     slope = np.cumsum(_fill(stack.play_weights_um_per_V, plays, 0.0)) * UM
@@ -94,8 +90,8 @@ def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[in
     high = stack.rate_high_um_per_s or (np.inf,)
     d = _fill(stack.dead_zone_thresholds_um, zones, stack.dead_zone_thresholds_um[-1] + 1.0, 1.0) * UM
     s = _fill(stack.dead_zone_weights, zones, 0.0)
-    return new_record(
-        operator_dtype(plays, zones, creep),
+    return new(
+        Operator,
         centre_V=stack.centre_V,
         level=slope[-1] * stack.centre_V + stack.level_um * UM,
         r=r,
@@ -115,7 +111,7 @@ def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[in
 
 
 @kernel
-def slopes_at(rate: float, stack: Record, out: Array) -> bool:
+def slopes_at(rate: float, stack: Operator, out: Array) -> bool:
     """``out`` (n,) = W_i at ``rate`` m/s, Ang 2004 (7.17), held at the ends of the law; True when one had to be
     limited.
 
@@ -177,7 +173,7 @@ def dead_zones(y: float, d: Array, s: Array) -> float:
 
 
 @kernel
-def stack_stroke(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+def stack_stroke(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: Operator) -> float:
     """Forward model, one tick: stroke m at ``drive_V``; moves ``plays`` and ``creep`` (m)."""
     y = play(drive_V - stack.centre_V, plays, slopes, stack.r) + stack.level
     x = dead_zones(y, stack.d, stack.s) + stack.offset
@@ -190,7 +186,7 @@ def stack_stroke(drive_V: float, slopes: Array, plays: Array, creep: Array, stac
 
 
 @kernel
-def drive(stroke_m: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+def drive(stroke_m: float, slopes: Array, plays: Array, creep: Array, stack: Operator) -> float:
     """Inverse model: drive V with which ``stroke`` would give ``stroke_m`` in this tick; nothing moves."""
     rest = stroke_m
     gain = 1.0

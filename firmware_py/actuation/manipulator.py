@@ -13,27 +13,25 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from firmware_py.records import Record
+from firmware_py.records import Array, field, record
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_matrix
-
-Array = NDArray[np.float64]
 
 NEWTON_PASSES = 3
 HALF_SQRT3 = 0.5 * sqrt(3.0)
 SQRT3 = sqrt(3.0)
 
-GEOMETRY = np.dtype(
-    [
-        ("circle_m", "f8"),  # R = r, pins and balls
-        ("shaft_m", "f8"),  # l
-        ("lever", "f8", (3,)),
-        ("rest_m", "f8", (3,)),  # ball heights at neutral
-        ("rest_tip", "f8", (3,)),  # what those heights do to the tip
-    ]
-)
+
+@record
+class Geometry:
+    """The numbers of the manipulator."""
+
+    circle_m: float = field("m")  # R = r, pins and balls
+    shaft_m: float = field("m")  # l
+    lever: Array = field("1", 3)
+    rest_m: Array = field("m", 3)  # ball heights at neutral
+    rest_tip: Array = field("m", 3)  # what those heights do to the tip
 
 
 @kernel
@@ -49,7 +47,7 @@ def star_tip(heights: Array, circle_m: float, shaft_m: float, out: Array) -> Non
 
 
 @kernel
-def tip_from_strokes(strokes: Array, geometry: Record, out: Array) -> None:
+def tip_from_strokes(strokes: Array, geometry: Geometry, out: Array) -> None:
     """Forward kinematics: ``out`` (3,) m tip displacement from neutral for ``strokes`` (3,) m, manipulator frame."""
     heights = scratch(3)
     for i in range(3):
@@ -73,7 +71,7 @@ def tilt_jacobian(ax: float, ay: float, circle_m: float, shaft_m: float, out: Ar
 
 
 @kernel
-def tip_jacobian(strokes: Array, geometry: Record, out: Array) -> None:
+def tip_jacobian(strokes: Array, geometry: Geometry, out: Array) -> None:
     """``out`` (3, 3): derivative of the tip displacement by the strokes, m/m."""
     r, shaft = geometry.circle_m, geometry.shaft_m
     z = scratch(3)
@@ -98,7 +96,7 @@ def tip_jacobian(strokes: Array, geometry: Record, out: Array) -> None:
 
 
 @kernel
-def strokes_from_tip(tip: Array, geometry: Record, warm: Array, out: Array) -> int:
+def strokes_from_tip(tip: Array, geometry: Geometry, warm: Array, out: Array) -> int:
     """Inverse kinematics: ``out`` (3,) = actuator strokes m from neutral for ``tip`` (3,) m, manipulator frame.
 
     ``warm`` (2,): tilt to start from, the solution when it returns. Returns the number of Newton steps (0 to

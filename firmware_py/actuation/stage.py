@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from math import exp
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.hysteresis import (
+    Operator,
     drive,
-    operator_dtype,
     operator_params,
     plays_at,
     sizes_of,
@@ -19,7 +18,7 @@ from firmware_py.actuation.hysteresis import (
     stack_stroke,
 )
 from firmware_py.actuation.limits import limit_slew, limit_voltage
-from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip, tip_from_strokes
+from firmware_py.actuation.manipulator import Geometry, star_tip, strokes_from_tip, tip_from_strokes
 from firmware_py.actuation.reach import inside, nearest_reachable
 from firmware_py.actuation.yielding import Swing, YieldLimits, YieldState, shrink_core, yield_rest
 from firmware_py.frame import (
@@ -39,68 +38,63 @@ from firmware_py.frame import (
     TREMOR_AHEAD,
     TREMOR_CORE,
 )
-from firmware_py.records import Record, attributes, copy_record, dtype_of, new_record
+from firmware_py.records import Array, Integers, Records, attributes, copy_record, field, new, record
 from hal.compiled import kernel
 from hal.scratch import scratch
-
-Array = NDArray[np.float64]
-
 
 LIMITS = ("workspace", "voltage", "slew", "singular", "yield")  # the bits of Clip in order
 TAPS = 16  # the most that a configuration may have; one size, one compilation
 
 
-def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
-    return np.dtype(
-        [
-            ("gain", "f8"),
-            ("ramp_step", "f8"),
-            ("rest_keep", "f8"),
-            ("min_confidence", "f8"),
-            ("tick_hz", "f8"),
-            ("yield_keep", "f8"),
-            ("overdrive", "f8"),
-            ("tilts", "i8"),
-            ("centre", "f8"),  # m of every stroke, where compensation works about
-            ("mounting", "f8", (3, 3)),
-            ("geometry", GEOMETRY),
-            ("low_V", "f8"),
-            ("high_V", "f8"),
-            ("neutral_V", "f8"),
-            ("slew_step_V", "f8"),
-            ("stroke_low", "f8", (3,)),  # m from neutral
-            ("stroke_high", "f8", (3,)),
-            ("swing_low", "f8", (3,)),  # m from ``centre``
-            ("swing_high", "f8", (3,)),
-            ("neutral_stroke", "f8", (3,)),  # m
-            ("taps", "f8", (3, TAPS)),
-            ("stacks", operator_dtype(n_plays, n_zones, n_creep), (3,)),
-        ]
-    )
+@record
+class ActuateParams:
+    """The numbers of the stage."""
+
+    gain: float = field("1")
+    ramp_step: float = field("1")
+    rest_keep: float = field("1")
+    min_confidence: float = field("1")
+    tick_hz: float = field("Hz")
+    yield_keep: float = field("1")
+    overdrive: float = field("1")
+    tilts: int = field("1")
+    centre: float = field("m")  # of every stroke, where compensation works about
+    mounting: Array = field("1", 3, 3)
+    geometry: Geometry = field("")
+    low_V: float = field("V")
+    high_V: float = field("V")
+    neutral_V: float = field("V")
+    slew_step_V: float = field("V")
+    stroke_low: Array = field("m", 3)  # from neutral
+    stroke_high: Array = field("m", 3)
+    swing_low: Array = field("m", 3)  # from ``centre``
+    swing_high: Array = field("m", 3)
+    neutral_stroke: Array = field("m", 3)
+    taps: Array = field("1", 3, TAPS)
+    stacks: Records[Operator] = field("", 3)
 
 
-def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
-    return np.dtype(
-        [
-            ("on", "f8", (3,)),  # 0 .. 1, how far compensation of each axis is switched on
-            ("tilt", "f8", (2,)),  # of the shaft, where the next inverse kinematics starts
-            ("yielding", dtype_of(YieldState)),
-            ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
-            ("target", "f8", (3,)),  # stroke from neutral that was asked of the stack, m
-            ("rest", "f8", (3,)),  # what hysteresis had left of the stroke when a hold ended, m; fades
-            ("command_V", "f8", (3,)),
-            ("plays", "f8", (3, n_plays)),
-            ("creep", "f8", (3, n_creep)),
-            ("slopes", "f8", (n_plays,)),
-            ("limited", "i8", (len(LIMITS),)),  # ticks in which each limit took
-        ]
-    )
+@record
+class ActuateState:
+    """The state of the stage."""
+
+    on: Array = field("1", 3)  # 0 .. 1, how far compensation of each axis is switched on
+    tilt: Array = field("rad", 2)  # of the shaft, where the next inverse kinematics starts
+    yielding: YieldState = field("")
+    strokes: Array = field("m", 3, TAPS)  # wanted ones, newest first
+    target: Array = field("m", 3)  # stroke from neutral that was asked of the stack
+    rest: Array = field("m", 3)  # what hysteresis had left of the stroke when a hold ended; fades
+    command_V: Array = field("V", 3)
+    plays: Array = field("V", 3, "plays")
+    creep: Array = field("m", 3, "creep")
+    slopes: Array = field("m/V", "plays")
+    limited: Integers = field("1", len(LIMITS))  # ticks in which each limit took
 
 
-def geometry_of(config: ActuationConfig) -> Record:
-    """Return the kinematics' parameters (dtype ``GEOMETRY``)."""
-    geometry = new_record(
-        GEOMETRY,
+def geometry_of(config: ActuationConfig) -> Records[Geometry]:
+    """Return the kinematics' parameters."""
+    geometry = new(
+        Geometry,
         circle_m=config.ball_circle_m,
         shaft_m=config.shaft_m,
         lever=config.lever_gain,
@@ -110,11 +104,12 @@ def geometry_of(config: ActuationConfig) -> Record:
     return geometry
 
 
-def actuate_params(config: ActuationConfig) -> Record:
+def actuate_params(config: ActuationConfig) -> Records[ActuateParams]:
     """Return all parameters of the stage."""
     sizes = sizes_of(*config.stacks)
-    params = new_record(
-        actuate_dtype(*sizes),
+    params = new(
+        ActuateParams,
+        dict(zip(("plays", "zones", "creep"), sizes, strict=True)),
         gain=config.gain,
         ramp_step=1.0 / (config.ramp_s * config.tick_hz),
         rest_keep=exp(-1.0 / (config.ramp_s * config.tick_hz)),
@@ -155,17 +150,17 @@ def actuate_params(config: ActuationConfig) -> Record:
     return params
 
 
-def actuate_state(config: ActuationConfig, params: Record) -> Record:
+def actuate_state(config: ActuationConfig, params: Records[ActuateParams]) -> Records[ActuateState]:
     """Return the state at neutral, as it is after the amplifier's first rise from 0 V."""
     plays, _, creep = sizes_of(*config.stacks)
-    state = new_record(actuate_state_dtype(plays, creep), command_V=config.neutral_V)
+    state = new(ActuateState, {"plays": plays, "creep": creep}, command_V=config.neutral_V)
     for i in range(3):
         state["plays"][0, i] = plays_at(attributes(params)[0].stacks[i], config.neutral_V, config.high_V)
     return state
 
 
 @kernel
-def command_stack(target: float, i: int, state: Record, param: Record) -> tuple[float, int]:
+def command_stack(target: float, i: int, state: ActuateState, param: ActuateParams) -> tuple[float, int]:
     """Return the limited drive V of stack ``i`` for the stroke ``target`` (m from neutral), and the Clip bits of the
     limits that acted.
 
@@ -187,7 +182,7 @@ def command_stack(target: float, i: int, state: Record, param: Record) -> tuple[
 
 
 @kernel
-def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+def actuate_kernel(frame: Array, states: Records[ActuateState], params: Records[ActuateParams]) -> None:
     """Fill the columns ``desired_tip`` to ``clip`` from ``tremor_ahead``, ``confidence`` and ``status``.
 
     Compensation of an axis fades in while its estimate is trusted and out while it is not. A wish that is not
@@ -252,7 +247,7 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
 
 
 @kernel
-def rest_kernel(states: Record) -> None:
+def rest_kernel(states: Records[ActuateState]) -> None:
     """Keep, after ``follow_kernel``, the stroke that hysteresis has left at neutral. It fades as compensation fades
     in, so that the first command after a hold is neutral itself."""
     state = states[0]

@@ -92,7 +92,7 @@ class LeaseGate:
 
     @property
     def left_ns(self) -> int:
-        """When the last transfer of the firmware was over."""
+        """Return when the last transfer of the firmware was over."""
         return self.words[LEFT_NS]
 
     @property

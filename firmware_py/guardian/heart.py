@@ -163,7 +163,7 @@ class Heart:
 
     @property
     def confirmed_ns(self) -> int:
-        """When the guardian's newest look that found neutral began."""
+        """Return when the guardian's newest look that found neutral began."""
         return self.words[_CONFIRMED]
 
     @property

@@ -73,8 +73,10 @@ def guarded(
 
 
 class VirtualGuardian:
-    """``Keeper`` of a guardian that steps by callbacks of a virtual clock, half a step beside the firmware's ticks; its
-    transfers take their time on the bus as the firmware's do. ``processes.dead`` ends it like ``kill -9``."""
+    """Keeps a guardian (``Keeper``) that steps by callbacks of a virtual clock half a step beside the firmware's ticks.
+
+    Its transfers take their time on the bus as the firmware's do. ``processes.dead`` ends it like ``kill -9``.
+    """
 
     def __init__(self, make: Callable[[Heart], Guardian], clock: VirtualClock, processes: Processes) -> None:
         self.heart = Heart()

@@ -16,7 +16,7 @@ from hal.contracts import AnalogOutput
 
 
 class InstrumentPlan(Protocol):
-    """A bench file resolved for an instrument, before a device is touched."""
+    """Defines a bench file that is resolved for an instrument, before a device is touched."""
 
     @property
     def bench(self) -> BenchFile: ...
@@ -29,8 +29,8 @@ class InstrumentPlan(Protocol):
 
 
 class OpenedInstrument(Protocol):
-    """An instrument whose devices are configured and not yet running. ``identities`` is what each probe found,
-    ``output`` what moves, ``columns`` names and units of the rows that are recorded."""
+    """Defines an instrument whose devices are configured and not yet running. ``identities`` is what each probe found,
+    ``output`` moves the actuators, ``columns`` are names and units of the rows that are recorded."""
 
     @property
     def identities(self) -> dict[str, str]: ...
@@ -49,9 +49,11 @@ class OpenedInstrument(Protocol):
 
 
 class Instrument(Protocol):
-    """A running instrument. ``tasks`` is its table, ``budget_us`` the bench file's own budgets; ``self_test`` is
-    ``None`` for an instrument that runs at once; ``closers`` are called in turn at the end, and may raise
-    ``HalError``."""
+    """Defines a running instrument. ``tasks`` is its table, ``budget_us`` the bench file's own budgets.
+
+    ``self_test`` is ``None`` for an instrument that runs at once. ``closers`` are called in turn at the end, and may
+    raise ``HalError``.
+    """
 
     @property
     def tasks(self) -> Sequence[TaskRow]: ...

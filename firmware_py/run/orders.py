@@ -26,7 +26,7 @@ class PageOrders:
         self._host_ns = host_ns
 
     def obey_all(self) -> None:
-        """Obey what has arrived since the last call; nothing without a page."""
+        """Obey every order that has arrived since the last call. Has no effect without a page."""
         if self._run.live is not None:
             for order in self._run.live.orders():
                 self._obey(order)

@@ -1,4 +1,4 @@
-"""The supervisor: one state machine that decides whether the actuators may move.
+"""Decides whether the actuators may move: the supervisor is one state machine.
 
 Outputs are armed only after the self-test. Whatever goes wrong, the amplifier ramps to neutral within ``RAMP_TICKS``.
 After a latched finding it stays there, and the first reason wins. After a recoverable one it holds there until

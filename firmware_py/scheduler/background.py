@@ -1,4 +1,4 @@
-"""Background tasks: generators that run in the slack between ticks, one declared step at a time."""
+"""Runs background tasks: generators that run in the slack between ticks, one declared step at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The static check: the promises of a task table must fit every tick before anything runs.
+"""Checks, before anything runs, that the promises of a task table fit every tick.
 
 ArduPilot finds out in flight (AP_Scheduler, pull request 12324); a table of fixed dividers can be checked once,
 over the least common multiple of the dividers (the hyperperiod).
@@ -63,7 +63,7 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
 
 
 def _with_waiting(load_ns: NDArray[np.int64], tasks: Sequence[TaskSpec], period_ns: int) -> NDArray[np.int64]:
-    """``load_ns`` with the tasks that may wait, each in the first tick from its own on that has room for it."""
+    """Return ``load_ns`` with each task that may wait in the first tick from its own on that has room for it."""
     hyperperiod = len(load_ns)
     full_ns = load_ns.copy()
     waiting: dict[str, tuple[TaskSpec, int]] = {}
@@ -87,7 +87,7 @@ def _with_waiting(load_ns: NDArray[np.int64], tasks: Sequence[TaskSpec], period_
 
 
 def in_order(tasks: Sequence[TaskSpec]) -> list[TaskSpec]:
-    """The order of execution within a tick: by ``order``, then as written."""
+    """Return the tasks in the order of execution within a tick: by ``order``, then as written."""
     return sorted(tasks, key=lambda t: t.order)
 
 

@@ -17,7 +17,7 @@ _N_BUCKETS = (_LAST_NS.bit_length() - _SUB_BITS) * _SUB + _SUB
 
 
 def bucket_of(value_ns: int) -> int:
-    """Index of the bucket that counts ``value_ns`` (0 .. 68 s; larger values share the last bucket)."""
+    """Return the index of the bucket that counts ``value_ns`` (0 .. 68 s; larger values share the last bucket)."""
     if value_ns > _LAST_NS:
         return _N_BUCKETS - 1
     octave = value_ns.bit_length() - _SUB_BITS - 1
@@ -25,7 +25,7 @@ def bucket_of(value_ns: int) -> int:
 
 
 def bucket_bounds_ns(index: int) -> tuple[int, int]:
-    """Smallest value and width of bucket ``index``, in ns."""
+    """Return the smallest value and the width of bucket ``index``, in ns."""
     if index < 2 * _SUB:
         return index, 1
     octave = (index >> _SUB_BITS) - 1
@@ -49,7 +49,7 @@ class Distribution:
     max_tick: int
 
     def as_dict(self) -> dict[str, float]:
-        """The form of the ``micron run`` JSON."""
+        """Return the statistics in the form of the ``micron run`` JSON."""
         return {
             "n": self.n,
             "p50": self.p50_us,

@@ -1,4 +1,4 @@
-"""Real-time settings of the loop's process: each is tried, reported as data, and undone.
+"""Makes the real-time settings of the loop's process: each is tried, reported as data, and undone.
 
 A machine that permits none of them still runs the loop; the report says what it ran with. Effects measured in
 design/algorithms.md section F: SCHED_FIFO takes the 99th percentile of lateness from milliseconds to 0.1 ms.
@@ -144,7 +144,7 @@ def _check(result: int) -> None:
 
 
 def _quietly(undo: Callable[[], object]) -> None:
-    """Leaving must not fail: a right that was taken away meanwhile is no reason to lose the run's report."""
+    """Undo a setting, and ignore a failure: a right that was taken away meanwhile must not cost the run's report."""
     try:
         undo()
     except OSError:

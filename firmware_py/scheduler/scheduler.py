@@ -1,9 +1,9 @@
-"""A cooperative scheduler: tasks run to completion, in a fixed order, at dividers of one tick.
+"""Schedules tasks cooperatively: they run to completion, in a fixed order, at dividers of one tick.
 
-Tick k is due at t0 + k*T; who drives ``tick`` (DAQ scans or the host clock) owns t0. After a stall whole periods
-are skipped, the phase of every task is kept, and what was skipped is counted per task and told to the tasks
-(FreeRTOS kernel issues 1339 and 1349). Promises per task as in ArduPilot AP_Scheduler, distributions instead of
-maxima.
+Tick k is due at t0 + k*T; the caller of ``tick`` (DAQ scans or the host clock) owns t0. After a stall whole periods
+are skipped, the phase of every task is kept, and skipped runs are counted per task and reported to it (FreeRTOS kernel
+issues 1339 and 1349). Each task promises a budget and a deadline as in ArduPilot's AP_Scheduler; distributions are kept
+instead of maxima.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class _Ignored:
 class Scheduler:
     """Runs a checked task table; ``tick`` and ``catch_up`` are called by whoever owns the time base.
 
-    ``BenchError`` at construction when the budgets or deadlines of any tick of the hyperperiod do not fit.
+    Raises ``BenchError`` at construction when the budgets or deadlines of any tick of the hyperperiod do not fit.
     Thread CPU time is taken at every ``cpu_every``-th run of a task (a reading costs more than 1 us).
     """
 
@@ -254,7 +254,7 @@ class Scheduler:
 
     @property
     def is_announced(self) -> bool:
-        """True if the next tick is an announced one-off (``ignore_next``)."""
+        """Return True if the next tick is an announced one-off (``ignore_next``)."""
         return bool(self._ignoring)
 
     def _advance_scan(self, k: int) -> int:

@@ -34,7 +34,7 @@ class TaskSnapshot:
     cpu: Distribution
 
     def as_dict(self) -> dict[str, object]:
-        """The form of the ``micron run`` JSON."""
+        """Return the snapshot in the form of the ``micron run`` JSON."""
         return {
             "rate_hz": self.rate_hz,
             "runs": self.runs,

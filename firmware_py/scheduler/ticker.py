@@ -16,7 +16,7 @@ ROUNDING_NS = 1000  # a timeout in float seconds may come back a little early
 
 
 class Ticks(NamedTuple):
-    """``n`` >= 1 consecutive ticks that are due now, the first one ``k0``, due at ``due_ns``, ``dt_ns`` apart.
+    """Holds ``n`` >= 1 consecutive ticks that are due now, ``dt_ns`` apart; ``k0`` is the first, due at ``due_ns``.
 
     ``source`` HOST means that no scan came with them.
     """
@@ -29,13 +29,13 @@ class Ticks(NamedTuple):
 
 
 class Ticker(Protocol):
-    """A time base: ``wait`` returns when at least one tick is due. Tick numbers grow; a gap is a skip."""
+    """Defines a time base: ``wait`` returns when at least one tick is due. Tick numbers grow; a gap is a skip."""
 
     def wait(self) -> Ticks: ...
 
 
 class HostTicker:
-    """Ticks at ``t0_ns + k * period_ns`` of the host clock. When whole periods have passed, the newest due
+    """Delivers ticks at ``t0_ns + k * period_ns`` of the host clock. When whole periods have passed, the newest due
     tick is delivered and the others are skipped: the phase is kept and nothing is made up for."""
 
     def __init__(self, clock: Clock, period_ns: int, t0_ns: int, k0: int = 0) -> None:
@@ -45,7 +45,7 @@ class HostTicker:
         self._next = k0
 
     def wait(self) -> Ticks:
-        """Sleep until the next tick is due; not at all when it is due already."""
+        """Sleep until the next tick is due, and return it; return at once when it is due already."""
         self._clock.sleep_until_ns(self._t0_ns + self._next * self._period_ns)
         newest = (self._clock.now_ns() - self._t0_ns) // self._period_ns
         self._next = newest + 1

@@ -11,7 +11,6 @@ say, A = (L - g(L_y) - h(L_z)) / (1 + r(L_z)), which is Ang 2004 (3.11)-(3.14) w
 from __future__ import annotations
 
 from math import exp
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from firmware_py.frame import (
     TEMPERATURE,
     VOLTS,
 )
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Integers, Records, field, new, record
 from firmware_py.sensing.config import MOST_AXES, SensingConfig
 from hal.compiled import kernel
 from hal.scratch import scratch
@@ -37,35 +36,33 @@ from hal.scratch import scratch
 TEMPERATURE_SMOOTHING_S = 1.0
 
 
-def calibration_dtype(n: int) -> np.dtype[Any]:
-    """Numbers of ``n`` axes; a supply or temperature channel of -1 is not there."""
-    return np.dtype(
-        [
-            ("lsb_V", "f8"),
-            ("channel", "i8", (n,)),
-            ("bias_V", "f8", (n,)),
-            ("scale_V", "f8", (n,)),  # per m/s^2
-            ("bias_V_per_C", "f8", (n,)),
-            ("scale_per_C", "f8", (n,)),
-            ("in_plane", "i8", (n,)),
-            ("out_of_plane", "i8", (n,)),
-            ("bias_in_plane", "f8", (n, 2)),  # 1, s^2/m
-            ("bias_out_of_plane", "f8", (n, 2)),
-            ("scale_out_of_plane", "f8", (n, 2)),  # s^2/m, s^4/m^2
-            ("range", "f8"),  # m/s^2
-            ("supply_channel", "i8"),
-            ("supply_divider", "f8"),
-            ("nominal_supply_V", "f8"),
-            ("supply_smoothing", "f8"),
-            ("temperature_channel", "i8"),
-            ("temperature_offset_V", "f8"),
-            ("temperature_C_per_V", "f8"),
-            ("reference_C", "f8"),
-            ("temperature_smoothing", "f8"),
-            ("magnetometer_bias_V", "f8", (3,)),
-            ("magnetometer_uT_per_V", "f8", (3, 3)),  # misalignment included
-        ]
-    )
+@record
+class Calibration:
+    """The numbers of ``n`` axes. A supply or temperature channel of -1 is not there."""
+
+    lsb_V: float = field("V")
+    channel: Integers = field("1", "n")
+    bias_V: Array = field("V", "n")
+    scale_V: Array = field("V s^2/m", "n")
+    bias_V_per_C: Array = field("V/K", "n")
+    scale_per_C: Array = field("1/K", "n")
+    in_plane: Integers = field("1", "n")
+    out_of_plane: Integers = field("1", "n")
+    bias_in_plane: Array = field("1, s^2/m", "n", 2)
+    bias_out_of_plane: Array = field("1, s^2/m", "n", 2)
+    scale_out_of_plane: Array = field("s^2/m, s^4/m^2", "n", 2)
+    range: float = field("m/s^2")
+    supply_channel: int = field("1")
+    supply_divider: float = field("1")
+    nominal_supply_V: float = field("V")
+    supply_smoothing: float = field("1")
+    temperature_channel: int = field("1")
+    temperature_offset_V: float = field("V")
+    temperature_C_per_V: float = field("degC/V")
+    reference_C: float = field("degC")
+    temperature_smoothing: float = field("1")
+    magnetometer_bias_V: Array = field("V", 3)
+    magnetometer_uT_per_V: Array = field("uT/V", 3, 3)  # misalignment included
 
 
 def reading_names(axes: int) -> tuple[str, ...]:
@@ -74,13 +71,13 @@ def reading_names(axes: int) -> tuple[str, ...]:
     return names[:axes]
 
 
-def calibration_params(config: SensingConfig) -> Record:
-    """Return the kernels' parameters (``calibration_dtype``) from the configuration."""
+def calibration_params(config: SensingConfig) -> Records[Calibration]:
+    """Return the kernels' parameters from the configuration."""
     g = config.gravity_m_s2
     dt = 1.0 / config.tick_hz
     magnetometer_scale = np.array(config.magnetometer_scale_V_per_uT)
-    return new_record(
-        calibration_dtype(len(config.channels)),
+    return new(
+        Calibration,
         lsb_V=config.lsb_V,
         channel=config.channels,
         bias_V=config.bias_V,
@@ -110,7 +107,7 @@ def calibration_params(config: SensingConfig) -> Record:
 
 @kernel
 def calibrate(
-    frame: NDArray[np.float64], smoothed: NDArray[np.float64], params: Record, readings: NDArray[np.float64]
+    frame: NDArray[np.float64], smoothed: NDArray[np.float64], params: Calibration, readings: NDArray[np.float64]
 ) -> int:
     """Fill volts, supply, temperature, accelerometer columns and ``readings`` (N,); returns status bits, or -1 for a
     reading that is not finite (nothing but ``volts`` is written then).
@@ -156,7 +153,7 @@ def calibrate(
 
 
 @kernel
-def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64]) -> None:
+def composite(line: NDArray[np.float64], params: Calibration, out: NDArray[np.float64]) -> None:
     """``out`` (N,) m/s^2 from the axes' lines (N,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (Ang 2004 (3.4))."""
     for i in range(len(line)):
         y, z = line[params.in_plane[i]], line[params.out_of_plane[i]]
@@ -166,7 +163,7 @@ def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64
 
 
 @kernel
-def calibrate_magnetometer(frame: NDArray[np.float64], params: Record) -> bool:
+def calibrate_magnetometer(frame: NDArray[np.float64], params: Calibration) -> bool:
     """Fill the magnetometer columns from its volts. Return False, and write nothing, when they are not finite."""
     for i in range(3):
         if not np.isfinite(frame[MAGNETOMETER_RAW + i]):

@@ -7,23 +7,24 @@ are solved at once, weighted by their noise; the three differences of Ang 2004 (
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from hal.compiled import kernel
 
 MAX_RATE_RAD_S = 20.0
 """No hand turns faster than this."""
 
 
-def kinematics_dtype(n: int) -> np.dtype[Any]:
-    """``solve`` (6, n) maps readings to (f, alpha); ``axes`` and ``positions`` are (n, 3), m; ``weight`` 1 / noise."""
-    return np.dtype(
-        [("solve", "f8", (6, n)), ("axes", "f8", (n, 3)), ("positions", "f8", (n, 3)), ("weight", "f8", (n,))]
-    )
+@record
+class Kinematics:
+    """The numbers of ``n`` axes."""
+
+    solve: Array = field("1, 1/m", 6, "n")  # from readings to (f, alpha)
+    axes: Array = field("1", "n", 3)
+    positions: Array = field("m", "n", 3)
+    weight: Array = field("1", "n")  # least noise over that of the axis
 
 
 def observation_matrix(positions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -31,7 +32,9 @@ def observation_matrix(positions: NDArray[np.float64], axes: NDArray[np.float64]
     return np.hstack([axes, np.cross(positions, axes)])
 
 
-def kinematic_params(positions: NDArray[np.float64], axes: NDArray[np.float64], noise: NDArray[np.float64]) -> Record:
+def kinematic_params(
+    positions: NDArray[np.float64], axes: NDArray[np.float64], noise: NDArray[np.float64]
+) -> Records[Kinematics]:
     """Weighted least squares for N >= 6 axes: positions (N, 3) m, unit axes (N, 3), noise (N,) in any one unit.
 
     Raises ValueError when the six unknowns cannot be told apart.
@@ -41,16 +44,14 @@ def kinematic_params(positions: NDArray[np.float64], axes: NDArray[np.float64], 
         raise ValueError(f"{len(observe)} axes at these positions do not determine six degrees of freedom")
     weighted = observe / noise[:, None]
     solve = np.linalg.pinv(weighted) / noise
-    return new_record(
-        kinematics_dtype(len(axes)), solve=solve, axes=axes, positions=positions, weight=noise.min() / noise
-    )
+    return new(Kinematics, solve=solve, axes=axes, positions=positions, weight=noise.min() / noise)
 
 
 @kernel
 def solve_motion(
     readings: NDArray[np.float64],
     rate: NDArray[np.float64],
-    params: Record,
+    params: Kinematics,
     out: NDArray[np.float64],
 ) -> None:
     """``out[:6]`` = (f m/s^2, alpha rad/s^2) from readings (N,) m/s^2 and the body rate (3,) rad/s."""
@@ -78,7 +79,7 @@ def plausible_rate(rate: NDArray[np.float64]) -> bool:
 
 
 @kernel
-def centripetal_change(before: NDArray[np.float64], now: NDArray[np.float64], params: Record) -> float:
+def centripetal_change(before: NDArray[np.float64], now: NDArray[np.float64], params: Kinematics) -> float:
     """Return the largest change of a reading's centripetal part (m/s^2) between two body rates (3,) in rad/s."""
     largest = 0.0
     square = now[0] ** 2 + now[1] ** 2 + now[2] ** 2 - before[0] ** 2 - before[1] ** 2 - before[2] ** 2

@@ -32,7 +32,7 @@ def solve_numeric(
 ) -> int:
     """``out[:6]`` = (f m/s^2, alpha rad/s^2) from readings (N,) m/s^2; the rate is ``previous_rate + dt_s * alpha``.
 
-    ``params`` is of ``kinematics_dtype``. Returns the iterations it took, at most three; -1 when they were not enough:
+    Returns the iterations it took, at most three; -1 when they were not enough:
     ``out`` is then the solution with the centripetal part of the previous rate (``solve_motion``).
     """
     solve_motion(readings, previous_rate, params, out)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,22 +23,18 @@ from firmware_py.frame import (
     TIP_ACCELERATION,
     TIP_DISPLACEMENT,
 )
-from firmware_py.records import Record, copy_record, new_record
+from firmware_py.records import Array, Records, copy_record, field, new, record
 from firmware_py.sensing.attitude import align, attitude_params, attitude_state, restart, step_attitude
+from firmware_py.sensing.attitude_filter import AttitudeParams, AttitudeState
 from firmware_py.sensing.attitude_params import quiet_point
-from firmware_py.sensing.calibration import (
-    calibrate,
-    calibrate_magnetometer,
-    calibration_dtype,
-    calibration_params,
-)
+from firmware_py.sensing.calibration import Calibration, calibrate, calibrate_magnetometer, calibration_params
 from firmware_py.sensing.config import SensingConfig
-from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, plausible_rate, solve_motion
+from firmware_py.sensing.kinematics import Kinematics, kinematic_params, plausible_rate, solve_motion
 from firmware_py.sensing.leave_out import leave_out
 from firmware_py.sensing.numeric_kinematics import solve_guarded, solve_numeric
 from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
-    TRANSLATION,
+    Translation,
     integrate_band,
     integrator_sections,
     point_force,
@@ -58,57 +52,52 @@ LEAN_CORNER_HZ = 0.3
 """Corrections of the attitude slower than this reach the tip's gravity."""
 
 
-def sense_dtype(n: int, attitude: np.dtype[Any]) -> np.dtype[Any]:
-    """Numbers of the stage with ``n`` axes and the ``attitude`` of the chosen filter."""
-    return np.dtype(
-        [
-            ("calibration", calibration_dtype(n)),
-            ("kinematics", kinematics_dtype(n)),
-            ("attitude", attitude),
-            ("translation", TRANSLATION),
-            ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
-            ("lean_sections", "f8", (2, 5)),
-            ("max_gap_ticks", "f8"),
-            ("numeric", "i8"),  # kinematics: 1 numeric, 0 analytic
-            ("guard_m_s2", "f8"),  # largest change of a centripetal part for the analytic kinematics; inf: any
-            ("parities", "i8"),
-            ("null", "f8", (len(PARITIES), n)),  # combinations of readings free of f and alpha; zeros beyond N - 6
-        ]
-    )
+@record
+class SenseParams:
+    """The numbers of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
+
+    calibration: Calibration = field("")
+    kinematics: Kinematics = field("")
+    attitude: AttitudeParams = field("")
+    translation: Translation = field("")
+    quiet_point: Array = field("m", 3)  # where gravity is felt with the least noise
+    lean_sections: Array = field("1", 2, 5)
+    max_gap_ticks: float = field("1")
+    numeric: int = field("1")  # kinematics: 1 numeric, 0 analytic
+    guard_m_s2: float = field("m/s^2")  # largest change of a centripetal part for the analytic kinematics; inf: any
+    parities: int = field("1")
+    null: Array = field("s^2/m", N_PARITIES, "n")  # combinations of readings free of f and alpha; zeros beyond N - 6
 
 
-def sense_state_dtype(n: int, attitude: np.dtype[Any]) -> np.dtype[Any]:
-    """State of the stage with ``n`` axes and the ``attitude`` of the chosen filter."""
-    return np.dtype(
-        [
-            ("attitude", attitude),
-            ("smoothed", "f8", (2,)),  # supply V, temperature degC
-            ("readings", "f8", (n,)),
-            ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
-            ("memory", "f8", (3, 2, 2)),  # band integrator
-            ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
-            ("turned", "f8", (3,)),  # correction of the last tick
-            ("last_tick", "f8"),
-            ("fallbacks", "i8"),  # ticks that the chosen kinematics left to the other one
-        ]
-    )
+@record
+class SenseState:
+    """The state of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
+
+    attitude: AttitudeState = field("")
+    smoothed: Array = field("V, degC", 2)  # supply, temperature
+    readings: Array = field("m/s^2", "n")
+    motion: Array = field("m/s^2, rad/s^2", 6)  # specific force and angular acceleration of the origin
+    memory: Array = field("m", 3, 2, 2)  # band integrator
+    lean: Array = field("rad", 3, 2, 2)  # the same for the attitude's corrections
+    turned: Array = field("rad", 3)  # correction of the last tick
+    last_tick: float = field("1")
+    fallbacks: int = field("1")  # ticks that the chosen kinematics left to the other one
 
 
-def sense_params(config: SensingConfig) -> Record:
-    """Return all parameters of the stage (``sense_dtype``)."""
+def sense_params(config: SensingConfig) -> Records[SenseParams]:
+    """Return all parameters of the stage."""
     places, axes, n = config.axis_positions(), np.array(config.axes), len(config.channels)
     # rms of a sample behind the RC: density times the root of its noise bandwidth, a quarter of the corner in rad/s
     noise = 1e-6 * STANDARD_GRAVITY * np.array(config.noise_ug_per_rtHz) * (0.25 * config.cutoff_rad_s) ** 0.5
     null = np.zeros((len(PARITIES), n))
     null[: n - 6] = parity_rows(places, axes, noise)
-    attitude = attitude_params(config)
-    return new_record(
-        sense_dtype(n, attitude.dtype),
+    return new(
+        SenseParams,
         parities=n - 6,
         null=null,
         calibration=calibration_params(config),
         kinematics=kinematic_params(places, axes, np.array(config.noise_ug_per_rtHz)),
-        attitude=attitude,
+        attitude=attitude_params(config),
         translation=translation_params(config),
         quiet_point=quiet_point(config)[0],
         lean_sections=integrator_sections(config.tick_hz, LEAN_CORNER_HZ),
@@ -118,15 +107,14 @@ def sense_params(config: SensingConfig) -> Record:
     )
 
 
-def sense_state(config: SensingConfig) -> Record:
-    """Return the state before the first sample (``sense_state_dtype``)."""
-    attitude = attitude_state(config)
-    dtype = sense_state_dtype(len(config.channels), attitude.dtype)
-    return new_record(dtype, attitude=attitude, smoothed=np.nan, last_tick=np.nan)
+def sense_state(config: SensingConfig) -> Records[SenseState]:
+    """Return the state before the first sample."""
+    n = len(config.channels)
+    return new(SenseState, {"n": n}, attitude=attitude_state(config), smoothed=np.nan, last_tick=np.nan)
 
 
 @kernel
-def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
+def _smooth_up(state: SenseState, param: SenseParams, up: NDArray[np.float64]) -> None:
     """``up`` (3,), body frame, without what corrections of the attitude do in the tremor band.
 
     There the attitude shall be the double integral of alpha alone, which has the phase of the specific force. The
@@ -147,7 +135,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
 
 
 @kernel
-def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> None:
+def _redundancy(state: SenseState, param: SenseParams, frame: NDArray[np.float64]) -> None:
     """Write the parity residuals of the axes beyond six into the frame."""
     left = scratch(N_PARITIES)
     parity(state.readings, state.attitude.rate, param, left)
@@ -156,7 +144,7 @@ def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> Non
 
 
 @kernel
-def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+def sense_kernel(frame: NDArray[np.float64], states: Records[SenseState], params: Records[SenseParams]) -> None:
     """Fill the columns from ``volts`` to ``tip_displacement``; adds its bits to ``status``.
 
     A sample that is not finite leaves estimates as they were and sets INVALID. After lost scans the attitude
@@ -240,7 +228,7 @@ class Sensing:
     @property
     def fallbacks(self) -> int:
         """Return the number of ticks in which the chosen kinematics could not be used and the other one stood in."""
-        return int(np.atleast_1d(self.state)["fallbacks"][0])
+        return int(np.ravel(self.state["fallbacks"])[0])
 
     def leave_out(self, axis: int, usual: NDArray[np.float64]) -> float:
         """Go on without ``axis``; see ``leave_out.leave_out``."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.designs import design
-from firmware_py.records import Record, new_record
+from firmware_py.records import Array, Records, field, new, record
 from firmware_py.sensing.config import SensingConfig
 from hal.compiled import kernel
 
@@ -21,13 +21,19 @@ CORNER_HZ = 2.0
 DAMPING = 0.7
 
 
-TRANSLATION = np.dtype([("tip_m", "f8", (3,)), ("gravity", "f8"), ("sections", "f8", (2, 5))])
+@record
+class Translation:
+    """The numbers of the tip's translation."""
+
+    tip_m: Array = field("m", 3)
+    gravity: float = field("m/s^2")
+    sections: Array = field("1", 2, 5)  # the integrator's biquads, rows b0 b1 b2 a1 a2
 
 
-def translation_params(config: SensingConfig) -> Record:
-    """Tip position, gravity m/s^2 and the integrator's biquads (rows b0 b1 b2 a1 a2)."""
-    return new_record(
-        TRANSLATION,
+def translation_params(config: SensingConfig) -> Records[Translation]:
+    """Return the numbers of the tip's translation from the configuration."""
+    return new(
+        Translation,
         tip_m=config.tip_m,
         gravity=config.gravity_m_s2,
         sections=integrator_sections(config.tick_hz),
@@ -86,7 +92,7 @@ def tip_acceleration(
     bias: NDArray[np.float64],
     rate: NDArray[np.float64],
     up: NDArray[np.float64],
-    params: Record,
+    params: Translation,
     out: NDArray[np.float64],
 ) -> None:
     """``out`` (3,) = acceleration of the tip, body frame: its specific force minus g ``up``, the third row of C_WB."""

@@ -65,7 +65,7 @@ def inverse_kernel(
 def rest_stroke(stack: StackConfig, drive_V: float, tick_hz: float, high_V: float) -> tuple[Record, Array, float]:
     """Return the stack's numbers with creep counted from rest at ``drive_V``, its play states (n,) and its stroke in m
     there."""
-    params = operator_params(stack, tick_hz)
+    params: Record = operator_params(stack, tick_hz)
     at = attributes(params)[0]
     plays, slopes, none = plays_at(at, drive_V, high_V), np.empty(len(at.r)), np.zeros(len(at.creep_share))
     slopes_at(0.0, params[0], slopes)

@@ -1,4 +1,4 @@
-"""``--bench``, the same in every command."""
+"""Defines ``--bench`` and ``--virtual``, the same in every command."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ def pace_of(virtual: bool) -> Pace | None:
 
 
 def bench_path(chosen: Path | str | None) -> Path:
-    """The chosen bench, by its path or by the name of one that ships. Where its file names code that is not ours, the
-    command goes on in a process of its own, and this call ends with its status. Raises ``InputError``.
+    """Return the bench file that a path or the name of a shipped bench chooses. Raises ``InputError``.
+
+    Where the file names code of other packages, the command goes on in a process of its own, and this call ends with
+    its status.
     """
     from tools.cli.supervise import supervise
     from tools.emulate.shipped import bench_file

@@ -1,4 +1,4 @@
-"""``micron calibrate``: from calibration recordings to the files that a bench names under [firmware] calibration."""
+"""Implements ``micron calibrate``: it makes the files that a bench names under [firmware] calibration."""
 
 from __future__ import annotations
 

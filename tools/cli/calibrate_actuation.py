@@ -1,4 +1,4 @@
-"""``micron calibrate piezo`` and ``manipulator``: the actuation stage's calibration files."""
+"""Implements ``micron calibrate piezo`` and ``manipulator``: the actuation stage's calibration files."""
 
 from __future__ import annotations
 

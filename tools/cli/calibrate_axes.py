@@ -1,4 +1,4 @@
-"""``micron calibrate accelerometer`` and ``magnetometer``: three-axis sensors from logs without a stage."""
+"""Implements ``micron calibrate accelerometer`` and ``magnetometer``, for three-axis sensors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Columns = Annotated[str, typer.Option(help="The three columns, with commas.")]
 
 
 def three(columns: str) -> tuple[str, str, str]:
-    """Three names from one option."""
+    """Return the three names in one option, or raise ``InputError``."""
     names = tuple(name.strip() for name in columns.split(","))
     if len(names) != 3:
         raise InputError(f"--columns {columns}: three names are needed")
@@ -52,7 +52,7 @@ def three(columns: str) -> tuple[str, str, str]:
 
 
 def print_parameters(title: str, parameters: dict, notes: list[str], json_file: str | None) -> None:
-    """A table of estimates with their intervals, and lines below it; beside JSON on standard output, on the other."""
+    """Print a table of estimates with their intervals, and notes; on standard error if JSON is on the other."""
     to = console() if json_file == "-" else data_console()
     table = table_of(title, "parameter", "value", "95 % interval")
     for name, e in parameters.items():

@@ -1,4 +1,4 @@
-"""``micron calibrate gyroscope``: from the log that calibrates the accelerometer beside it."""
+"""Implements ``micron calibrate gyroscope``, from the log that calibrates the accelerometer beside it."""
 
 from __future__ import annotations
 

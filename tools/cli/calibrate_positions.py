@@ -1,4 +1,4 @@
-"""``micron calibrate positions``: where the accelerometers sit, from a swing about the tip."""
+"""Implements ``micron calibrate positions``: it finds where the accelerometers sit, from a swing about the tip."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def data_console() -> Console:
 
 
 def print_whole(full: Table, narrow: Table | None = None) -> None:
-    """``full`` to standard output, no cell cut: as wide as it must be in a file or pipe.
+    """Print ``full`` on standard output without cutting a cell: as wide as it must be in a file or pipe.
 
     A terminal that is too narrow for it gets ``narrow`` instead, and is told so.
     """
@@ -74,7 +74,7 @@ def print_error(message: str) -> None:
 
 
 def print_note(message: str) -> None:
-    """``note: message`` on standard error."""
+    """Print ``note: message`` on standard error."""
     console().print(Text.assemble(("note:", "yellow"), " ", message), soft_wrap=True)
 
 
@@ -109,7 +109,7 @@ def clear_errors() -> Iterator[None]:
 
 
 def _how_to_trust(error: NotTrusted) -> str:
-    """The command that decides for what was refused: this one with its option, where it has it, else micron trust."""
+    """Return the command that permits what was refused: this one with its option, or micron trust."""
     if any(tuple(sys.argv[1 : 1 + len(command)]) == command for command in DECIDING):
         again = shlex.join(["micron", *sys.argv[1:], error.option])
         return f"If you trust its author, repeat: {again}"

@@ -1,4 +1,4 @@
-"""The diagnostic commands: thin over ``tools.diagnose``."""
+"""Implements the diagnostic commands, thin over ``tools.diagnose``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``micron emulate``: a bench's emulated devices for any program."""
+"""Implements ``micron emulate``: it serves a bench's emulated devices to any program."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def imu(
 
 
 def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tuple[list[Series], list[dict[str, Any]]]:
-    """Each sensor in turn: uncalibrated head, auto-calibration in the chip, ``seconds`` of watching."""
+    """Measure each sensor in turn: it calibrates itself, then it is recorded for ``seconds``."""
     from drivers.specs import check_devices
     from firmware_py.endoscope.wiring import open_sensors
     from hal.bench import load_bench, open_bench

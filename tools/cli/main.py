@@ -1,4 +1,4 @@
-"""Entry point: the list of commands, ``--version``, and nothing else.
+"""Defines the entry point: the list of commands, ``--version``, and nothing else.
 
 A command's modules are imported when it is called, not to print the list: with all of them, physics, kernels and
 statistics included, ``micron --help`` took seconds. What the list says of a command is the first sentence of its own
@@ -22,7 +22,7 @@ from tools.interrupt import install_handler, was_interrupted
 
 
 class Command(NamedTuple):
-    """A line of the list of commands."""
+    """Describes a line of the list of commands."""
 
     panel: str
     where: str
@@ -150,7 +150,7 @@ def _at(where: str) -> Any:
 
 
 def load(name: str) -> Any:
-    """The command ``name`` with its modules, as typer makes it."""
+    """Import the modules of the command ``name`` and return it, as typer makes it."""
     target = _at(COMMANDS[name].where)
     for inner, where in INSIDE.get(name, {}).items():
         if inner not in {command.name for command in target.registered_commands}:
@@ -164,7 +164,7 @@ def load(name: str) -> Any:
 
 
 def _with_brackets(command: Any) -> Any:
-    """``command`` with its help escaped: typer reads help as rich markup and leaves ``[firmware]`` out."""
+    """Escape the help of ``command`` and return it: typer reads help as rich markup and leaves ``[firmware]`` out."""
     from rich.markup import escape
 
     command.help = escape(command.help) if command.help else command.help
@@ -177,7 +177,7 @@ def _with_brackets(command: Any) -> Any:
 
 
 class Helpful(TyperGroup):
-    """A bare call is a question, not a mistake: the help on standard output, exit status 0."""
+    """Answers a call without arguments with the help on standard output and exit status 0."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if not args:

@@ -1,4 +1,4 @@
-"""``micron mismatch heal``: a bench that is better afterwards."""
+"""Implements ``micron mismatch heal``: it improves a bench by its own diagnosis."""
 
 from __future__ import annotations
 

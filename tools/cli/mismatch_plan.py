@@ -1,4 +1,4 @@
-"""``micron mismatch plan``: what to record next."""
+"""Implements ``micron mismatch plan``: it proposes what to record next."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tools.terminal import task_name
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """The JSON that ``diagnose --json`` wrote. InputError for anything else."""
+    """Return the JSON that ``diagnose --json`` wrote. Raises InputError for anything else."""
     try:
         body = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

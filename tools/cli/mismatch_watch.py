@@ -1,4 +1,4 @@
-"""``micron mismatch watch``: when and where a recording leaves its twin."""
+"""Implements ``micron mismatch watch``: it finds when and where a recording departs from its twin."""
 
 from __future__ import annotations
 

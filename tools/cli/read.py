@@ -1,4 +1,4 @@
-"""``micron read``: what the sensors of other packages say."""
+"""Implements ``micron read``: it takes one reading of every sensor of other packages."""
 
 from __future__ import annotations
 

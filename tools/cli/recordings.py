@@ -1,4 +1,4 @@
-"""``micron recover`` and ``micron export``: torn recordings made whole, and other formats."""
+"""Implements ``micron recover`` and ``micron export``: torn recordings made whole, and other formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole command as one click object: what the documentation's page of commands and the tests are made from."""
+"""Builds the whole command as one click object, from which the page of commands and the tests are made."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``micron run``: the instrument, closed loop, and what it did for the tip."""
+"""Implements ``micron run``: it runs the instrument in closed loop and reports what is left of the tremor."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def exit_status(result: Mapping[str, Any]) -> Exit:
 
 
 def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The outcome of the firmware plus the figures that need the truth."""
+    """Return the outcome of the firmware with the figures that need the truth."""
     empty = {"uncompensated_rms_um": None, "compensated_rms_um": None, "reduction_percent": None}
     figures: dict[str, Any] = {
         "tremor": {
@@ -303,7 +303,7 @@ class RearmKey:
 
 
 def _run_real(request: RunRequest, beside: RunWatch | None) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """The firmware in a process of its own: this one draws, and a busy thread beside the loop would cost ticks."""
+    """Run the firmware in a process of its own: this one draws, and a busy thread beside the loop would cost ticks."""
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         runtime_dir = Path(folder)
         fds = () if beside is None else beside.fds
@@ -343,7 +343,7 @@ def _run_real(request: RunRequest, beside: RunWatch | None) -> tuple[dict[str, A
 
 
 def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
-    """The firmware was killed: what became of the outputs."""
+    """Print what became of the outputs after the firmware was killed."""
     report, started = runtime_dir / REPORT, runtime_dir / STARTED
     limit_s = time.monotonic() + (float(started.read_text()) + END_S if started.exists() else 0.0)
     while not report.exists() and time.monotonic() < limit_s:

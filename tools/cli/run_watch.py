@@ -1,4 +1,4 @@
-"""The options ``--watch`` of ``micron run`` and ``micron bench``: what they need, checked before anything starts."""
+"""Implements ``--watch`` of ``micron run`` and ``micron bench``: what it needs is checked before anything starts."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def watch_settings(
 
 
 def check_twin(settings: Settings, file: BenchFile) -> None:
-    """InputError or RecordingError for a twin that cannot run beside the bench."""
+    """Raise InputError or RecordingError for a twin that cannot run beside the bench."""
     from firmware_py.frame import LAYOUT
     from tools.mismatch.watch.frame import World, open_twin
 
@@ -78,7 +78,7 @@ def check_twin(settings: Settings, file: BenchFile) -> None:
 
 
 class RunWatch:
-    """The memory in which a run shows its rows, and the watch that reads it."""
+    """Holds the memory in which a run shows its rows, and the watch that reads it."""
 
     def __init__(self, settings: Settings, file: BenchFile, world: World, *, is_patient: bool) -> None:
         """``is_patient``: the run may wait for the watch, because no time of the bench passes meanwhile."""

@@ -1,4 +1,4 @@
-"""``micron simulate``: the closed loop without wires, for sweeps: world and firmware in one compiled loop."""
+"""Implements ``micron simulate``: world and firmware run in one compiled loop without wires, for sweeps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``micron trust``: the user's decisions about programs and files that other people's folders name."""
+"""Implements ``micron trust``: the user's decisions about programs and files that other people's folders name."""
 
 from __future__ import annotations
 
