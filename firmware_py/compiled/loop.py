@@ -124,7 +124,7 @@ class CompiledMicron(Micron):
         words[at.WAKE_FD] = self._wake_read
         if verify := self.run.scheduler.find("verify"):
             words[at.VERIFY_DIVIDER], words[at.VERIFY_PHASE] = verify.divider, verify.phase
-            words[at.VERIFY_PATIENCE] = verify.may_wait
+            words[at.VERIFY_PATIENCE] = verify.deferrable
             words[at.VERIFY_END_NS] = self.run.scheduler.latest_end_ns
         stream, buffer = self._daq.memory
         field = self._field

@@ -34,7 +34,7 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
             f"the dividers repeat only after {hyperperiod} ticks ({dividers}); "
             f"choose dividers with a common multiple of at most {MAX_HYPERPERIOD_TICKS}"
         )
-    ordered = [task for task in in_order(tasks) if not task.may_wait]
+    ordered = [task for task in in_order(tasks) if not task.deferrable]
     load_ns = np.zeros(hyperperiod, dtype=np.int64)
     for task in ordered:
         due = load_ns[task.phase :: task.divider]
@@ -51,7 +51,7 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
             f"the budgets do not fit tick {worst} of {hyperperiod}: {_sum_text(ordered, worst)} "
             f"> {period_ns / 1000:g} us. Shorten a budget or move a phase"
         )
-    load_ns = _with_waiting(load_ns, [task for task in in_order(tasks) if task.may_wait], period_ns)
+    load_ns = _with_waiting(load_ns, [task for task in in_order(tasks) if task.deferrable], period_ns)
     slack_ns = period_ns - int(load_ns.min())
     for item in background:
         if item.worst_step_ns > slack_ns:
@@ -75,12 +75,12 @@ def _with_waiting(load_ns: NDArray[np.int64], tasks: Sequence[TaskSpec], period_
             waiting.pop(name, None)
             if full_ns[index] + task.budget_ns <= period_ns:
                 full_ns[index] += task.budget_ns
-            elif waited < task.may_wait:
+            elif waited < task.deferrable:
                 waiting[name] = task, waited + 1
             else:
                 raise BenchError(
-                    f"task {name!r} finds no room of {task.budget_us:g} us within {task.may_wait} ticks of the one in "
-                    f"which it is due (tick {index} of {hyperperiod} is full with {full_ns[index] / 1000:g} of "
+                    f"task {name!r} finds no room of {task.budget_us:g} us within {task.deferrable} ticks of the one "
+                    f"in which it is due (tick {index} of {hyperperiod} is full with {full_ns[index] / 1000:g} of "
                     f"{period_ns / 1000:g} us). Lower a rate of the bench file, or shorten a budget"
                 )
     return full_ns

@@ -29,15 +29,32 @@ class _LiveTask:
     """Holds a task with its counters."""
 
     __slots__ = (
-        "budget_ns", "catch_up", "cpu", "cpu_in", "deadline_ns", "duration", "errors", "fn", "ignored_runs",
-        "last_error", "lateness", "may_wait", "overruns", "put_off", "runs", "skipped", "slips", "spec", "waited",
+        "budget_ns",
+        "catch_up",
+        "cpu",
+        "cpu_in",
+        "deadline_ns",
+        "deferrable",
+        "duration",
+        "errors",
+        "fn",
+        "ignored_runs",
+        "last_error",
+        "lateness",
+        "overruns",
+        "put_off",
+        "runs",
+        "skipped",
+        "slips",
+        "spec",
+        "waited",
     )  # fmt: skip
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec
         self.fn = spec.fn
         self.catch_up = spec.catch_up
-        self.may_wait = spec.may_wait
+        self.deferrable = spec.deferrable
         self.waited = 0  # ticks, since it was due
         self.budget_ns = spec.budget_ns
         self.deadline_ns = spec.deadline_ns
@@ -146,9 +163,9 @@ class Scheduler:
                 task.skipped += 1
         return (*due, *(task for task in waiting if task not in due))
 
-    def _put_off(self, task: _LiveTask, due_ns: int) -> bool:
+    def _defer(self, task: _LiveTask, due_ns: int) -> bool:
         """Defer the deferrable ``task`` if it could end too late and has patience left. Return True if deferred."""
-        if task.waited >= task.may_wait or self._now_ns() + task.budget_ns <= due_ns + self._done_by_ns:
+        if task.waited >= task.deferrable or self._now_ns() + task.budget_ns <= due_ns + self._done_by_ns:
             task.waited = 0
             return False
         task.waited += 1
@@ -192,7 +209,7 @@ class Scheduler:
         tasks = tuple(due)
         if in_tick and self._waiting:
             tasks = self._with_waiting(tasks, others)
-        self._run(tasks, info, info, beside=True, may_put_off=in_tick)
+        self._run(tasks, info, info, beside=True, may_defer=in_tick)
 
     def next_beside(self, k: int, others: Collection[str]) -> int:
         """Return the first tick after ``k`` in which ``run_beside`` has something to run."""
@@ -283,7 +300,7 @@ class Scheduler:
         *,
         beside: bool = False,
         is_late: bool = False,
-        may_put_off: bool = True,
+        may_defer: bool = True,
     ) -> None:
         now_ns = self._now_ns
         ignored = self._ignored[self._ignoring[-1]] if self._ignoring and not beside else None
@@ -293,7 +310,7 @@ class Scheduler:
         done = 0
         try:
             for task in due:
-                if task.may_wait and may_put_off and self._put_off(task, due_ns):
+                if task.deferrable and may_defer and self._defer(task, due_ns):
                     done += 1
                     continue
                 task_info = scan_info if task.catch_up else info

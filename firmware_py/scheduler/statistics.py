@@ -11,10 +11,10 @@ from firmware_py.scheduler.histogram import Distribution
 class TaskSnapshot:
     """Holds the statistics of one task since the last ``reset``.
 
-    ``skipped``: releases that never ran; ``put_off``: how often it had to wait a tick; ``overruns``: runs longer than
-    the budget; ``slips``: runs that ended after the deadline; ``errors``: runs that raised. ``ignored_runs`` belong to
-    announced one-offs and are in none of the figures except ``runs``. ``cpu`` is thread CPU time of a sample of the
-    runs.
+    ``skipped``: releases that never ran; ``put_off``: ticks for which it was deferred; ``overruns``: runs longer than
+    the budget; ``slips``: deadline misses, runs that ended after the deadline; ``errors``: runs that raised.
+    ``ignored_runs`` belong to announced one-offs and are in none of the figures except ``runs``. ``cpu`` is thread CPU
+    time of a sample of the runs.
     """
 
     name: str

@@ -28,9 +28,9 @@ class TaskSpec:
 
     ``budget_us`` is the longest run it promises, ``deadline_us`` when it must be done, counted from the due
     time of the tick. ``catch_up``: runs for every scan of a block that arrived late, not only for the newest
-    (filters must see all data; an actuator must not be moved through the past). ``may_wait``: where its budget would
-    make the next tick late, the task is put off to the next tick, so many times in a row at most: slow devices give way
-    to the next command (ArduPilot's AP_Scheduler begins a task only where its time is left, too).
+    (filters must see all data; an actuator must not be moved through the past). ``deferrable``: ticks in a row for
+    which the task is deferred where its budget would make the next tick late; slow devices give way to the next command
+    (ArduPilot's AP_Scheduler begins a task only where its time is left, too).
     """
 
     name: str
@@ -41,7 +41,7 @@ class TaskSpec:
     budget_us: float
     deadline_us: float
     catch_up: bool = False
-    may_wait: int = 0
+    deferrable: int = 0
 
     def __post_init__(self) -> None:
         where = f"task {self.name!r}"
@@ -51,9 +51,9 @@ class TaskSpec:
             raise BenchError(f"{where}: phase is {self.phase}; with divider {self.divider} use 0..{self.divider - 1}")
         if not self.budget_us > 0.0:
             raise BenchError(f"{where}: budget_us is {self.budget_us}; a run takes time, promise more than 0")
-        if self.may_wait < 0 or (self.may_wait and self.catch_up):
+        if self.deferrable < 0 or (self.deferrable and self.catch_up):
             raise BenchError(
-                f"{where}: may_wait is {self.may_wait}; 0 or more, and 0 for a task that must see every scan"
+                f"{where}: deferrable is {self.deferrable}; 0 or more, and 0 for a task that must see every scan"
             )
         if not self.deadline_us >= self.budget_us:
             raise BenchError(

@@ -34,13 +34,13 @@ class Bench:
         deadline_us: float = 1000.0,
         cost_us: float | Callable[[int], float] = 50.0,
         catch_up: bool = False,
-        may_wait: int = 0,
+        deferrable: int = 0,
     ) -> TaskSpec:
         def fn(info: TickInfo) -> None:
             self.journal.append((name, info))
             self.clock.burn_ns(round((cost_us(info.k) if callable(cost_us) else cost_us) * US))
 
-        return TaskSpec(name, fn, divider, phase, order, budget_us, deadline_us, catch_up, may_wait)
+        return TaskSpec(name, fn, divider, phase, order, budget_us, deadline_us, catch_up, deferrable)
 
     def scheduler(self, *tasks: TaskSpec, **options: object) -> Scheduler:
         return Scheduler(tasks, self.clock, cpu_time_ns=self.clock.now_ns, **options)  # type: ignore[arg-type]

@@ -92,7 +92,7 @@ def test_an_error_behind_a_task_that_was_put_off_is_laid_at_the_right_door(bench
 
     scheduler = bench.scheduler(
         bench.task("late", cost_us=2000.0, budget_us=500.0),
-        bench.task("patient", order=1, budget_us=200.0, cost_us=10.0, may_wait=1),
+        bench.task("patient", order=1, budget_us=200.0, cost_us=10.0, deferrable=1),
         TaskSpec("bad", fail, 1, 0, 2, 10.0, 1000.0),
         bench.task("behind", order=3, budget_us=10.0, cost_us=1.0),
     )
@@ -107,7 +107,7 @@ def test_an_error_behind_a_task_that_was_put_off_is_laid_at_the_right_door(bench
 def test_who_waited_once_may_wait_again_after_it_ran(bench: Bench) -> None:
     scheduler = bench.scheduler(
         bench.task("late", cost_us=2000.0, budget_us=500.0),
-        bench.task("patient", divider=2, order=1, budget_us=200.0, cost_us=10.0, may_wait=1),
+        bench.task("patient", divider=2, order=1, budget_us=200.0, cost_us=10.0, deferrable=1),
     )
     for k in range(0, 40, 4):  # every fourth tick, late each time; due at each
         bench.clock.advance_to(10 * k * MS)
@@ -128,7 +128,7 @@ def test_a_skip_by_an_error_is_no_waiting(bench: Bench) -> None:
     scheduler = bench.scheduler(
         bench.task("late", cost_us=2000.0, budget_us=500.0),
         TaskSpec("bad", may_fail, 1, 0, 1, 10.0, 1000.0),
-        bench.task("patient", order=2, budget_us=200.0, cost_us=10.0, may_wait=1),
+        bench.task("patient", order=2, budget_us=200.0, cost_us=10.0, deferrable=1),
     )
     at(bench, scheduler, 0)
     bench.clock.advance_to(10 * MS)

@@ -1,4 +1,4 @@
-"""Tasks that may wait (``may_wait``): put off where the next command would be late, counted, never for long."""
+"""Tasks that may wait (``deferrable``): put off where the next command would be late, counted, never for long."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def bench() -> Bench:
     return Bench()
 
 
-def waiting_pair(bench: Bench, busy_us: Callable[[int], float], may_wait: int = 3) -> Scheduler:
+def waiting_pair(bench: Bench, busy_us: Callable[[int], float], deferrable: int = 3) -> Scheduler:
     """A command that takes ``busy_us(k)`` in tick k, and a slow device of 300 us in ticks 0, 5, 10, ..."""
     return bench.scheduler(
         bench.task("command", budget_us=500.0, cost_us=busy_us),
-        bench.task("slow", 5, 0, order=1, budget_us=400.0, cost_us=300.0, may_wait=may_wait),
+        bench.task("slow", 5, 0, order=1, budget_us=400.0, cost_us=300.0, deferrable=deferrable),
     )
 
 
@@ -45,7 +45,7 @@ def test_it_waits_so_many_ticks_and_no_more(bench: Bench):
 def test_what_is_due_again_while_it_waits_runs_once(bench: Bench):
     scheduler = bench.scheduler(
         bench.task("command", budget_us=500.0, cost_us=lambda k: 800.0 if k < 3 else 100.0),
-        bench.task("slow", 2, 0, order=1, budget_us=400.0, cost_us=300.0, may_wait=9),
+        bench.task("slow", 2, 0, order=1, budget_us=400.0, cost_us=300.0, deferrable=9),
     )
     bench.run(scheduler, 6)
     assert bench.ran("slow") == [3, 4]
@@ -66,10 +66,10 @@ def test_a_late_tick_sheds_its_slow_device_instead_of_passing_its_lateness_on(be
 
 
 def test_who_must_see_every_scan_may_not_wait(bench: Bench):
-    with pytest.raises(BenchError, match="may_wait is 1"):
-        bench.task("filter", catch_up=True, may_wait=1)
-    with pytest.raises(BenchError, match="may_wait is -1"):
-        bench.task("slow", may_wait=-1)
+    with pytest.raises(BenchError, match="deferrable is 1"):
+        bench.task("filter", catch_up=True, deferrable=1)
+    with pytest.raises(BenchError, match="deferrable is -1"):
+        bench.task("slow", deferrable=-1)
 
 
 def test_a_reset_counts_anew_what_was_put_off(bench: Bench):
@@ -83,7 +83,7 @@ def test_a_reset_counts_anew_what_was_put_off(bench: Bench):
 
 def test_what_a_compiled_loop_has_put_off_in_a_tick_waits_for_the_next_one(bench: Bench):
     """The rest of the tick must not ask again: its patience would be used up twice as fast, or it would run at once."""
-    scheduler = waiting_pair(bench, lambda k: 100.0, may_wait=2)
+    scheduler = waiting_pair(bench, lambda k: 100.0, deferrable=2)
     scheduler.defer("slow", 1)
     scheduler.run_beside(0, 0, 0, ("command", "slow"), in_tick=True)
     assert bench.ran("slow") == []
