@@ -419,7 +419,8 @@ _STRIBECK_BRISTLES = Effect(
     basis=_stribeck_bristle_basis,
     fill=_stribeck_bristle_fill,
     report=_stribeck_bristle_report,
-    vanishes_with=(("coulomb_forward", "static_friction"), ("coulomb_backward", "static_friction")),
+    vanishes_with=(("static_friction",),),
+    plain="coulomb_friction",
 )
 
 STRIBECK_FRICTION = Effect(
@@ -438,5 +439,6 @@ STRIBECK_FRICTION = Effect(
     fill=_stribeck_fill,
     report=_stribeck_report,
     variants=(_STRIBECK_BRISTLES,),
-    vanishes_with=(("coulomb_forward", "static_friction"), ("coulomb_backward", "static_friction")),
+    vanishes_with=(("static_friction",),),
+    plain="coulomb_friction",
 )

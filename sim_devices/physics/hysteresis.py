@@ -498,4 +498,5 @@ HYSTERESIS = Effect(
     report=_report,
     variants=(_FORCE,),
     vanishes_with=(("loop_width_share",),),
+    plain="backlash",
 )

@@ -6,15 +6,16 @@ always free. On a long recording the search begins on its first part, when that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.projected import Projected
+from tools.mismatch.engine.projected import Projected, Shrunk
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.trust import fit_loss, stayed, to_search
 from tools.mismatch.placed import Free
@@ -41,7 +42,8 @@ class Fit:
     """Holds a fitted model.
 
     ``theta`` has all parameters; ``residual[output]`` (m,) on the problem's view is measured minus simulated; ``cost``
-    is the weighted sum of squares on fit rows; ``at_bound`` names the parameters that ended at a bound.
+    is the weighted sum of squares on fit rows; ``at_bound`` names the parameters that ended at a bound. ``shrunk`` has
+    the priors of the weights of effects, per label.
     """
 
     model: Model
@@ -51,6 +53,7 @@ class Fit:
     at_bound: tuple[str, ...]
     evaluations: int
     ok: bool = True
+    shrunk: Mapping[str, Shrunk] = field(default_factory=dict[str, Shrunk], repr=False)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -260,18 +263,20 @@ def fit(
             left = tried[0][0]
         give_up = left > hopeless
     found: tuple[float, Array] | None = None
+    fitted: Projected | None = None
     for theta in best[:1] if give_up else best:
-        cost = np.inf
+        cost, projected = np.inf, None
         if not give_up:
-            least = min(rows, ground.fit_rows.size)
-            theta, cost, count = _finely(ground, model, outputs, theta, Effort(least, iterations, rounds, tolerance))
+            effort = Effort(min(rows, ground.fit_rows.size), iterations, rounds, tolerance)
+            theta, cost, count, projected = _finely(ground, model, outputs, theta, effort)
             evaluations += count
         if found is None or (np.isfinite(cost) and cost < found[0]):
-            found = (cost, theta)
+            found, fitted = (cost, theta), projected
     assert found is not None
     cost, theta = found
     if opening is not None and not give_up and np.isfinite(cost):
-        theta, cost, count = _finely(problem, model, outputs, theta, Effort(rows, 10, rounds, tolerance))
+        effort = Effort(rows, 10, rounds, tolerance)
+        theta, cost, count, fitted = _finely(problem, model, outputs, theta, effort)
         evaluations += count
     elif give_up and opening is not None:
         _, theta = Projected(problem, model, outputs, rows).evaluate(theta)
@@ -279,7 +284,8 @@ def fit(
     if keep is not None:
         residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
     ok = (give_up or bool(np.isfinite(cost))) and bool(np.all(np.isfinite(theta))) and stayed(problem, residual)
-    return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
+    shrunk = {**(keep.shrunk if keep is not None else {}), **(fitted.shrunk() if fitted is not None else {})}
+    return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok, shrunk)
 
 
 OPENING = frozenset(
@@ -329,8 +335,10 @@ def _finely(
     outputs: Sequence[str],
     theta: Array,
     effort: Effort,
-) -> tuple[Array, float, int]:
-    """Return (theta, cost, evaluations) after a search on some rows and another with reduced weights of outliers."""
+) -> tuple[Array, float, int, Projected]:
+    """Return (theta, cost, evaluations, residuals) after a search on some rows and another with reduced weights of
+    outliers and with the priors of the weights of effects.
+    """
     rows, iterations, rounds, tolerance = effort.rows, effort.iterations, effort.rounds, effort.tolerance
     before = 0
     if rows > 2 * SEARCH_ROWS:
@@ -346,12 +354,14 @@ def _finely(
             break
         if round_ + 1 < rounds:
             projected.reweight(residuals(problem, model, theta, outputs))
+            projected.shrink(theta, partial(slopes, projected))
     theta, cost = _put_away(projected, theta, cost)
-    return theta, cost, before + projected.evaluations
+    return theta, cost, before + projected.evaluations, projected
 
 
-NOTICED = 1.0
-"""Largest change of the cost, in noise variances, that counts as insignificant."""
+NOTICED = 3.84
+"""Largest change of the cost, in noise variances, that counts as insignificant: the 95 % quantile for a
+parameter that is not there."""
 
 
 def _put_away(projected: Projected, theta: Array, cost: float) -> tuple[Array, float]:

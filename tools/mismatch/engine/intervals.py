@@ -137,7 +137,9 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     r = np.clip(r, -limit, limit)
     size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
     js = j / size
-    bread = np.linalg.pinv(js.T @ js, rcond=1e-12)
+    data = js.T @ js
+    # what a prior adds shrinks an estimate and does not make it more uncertain
+    bread = np.linalg.pinv(data + np.diag(_priors(fitted) / stride / size**2), rcond=1e-12)
     block = np.zeros(rows.size, int)
     for b, (start, stop) in enumerate(problem.fit_blocks):
         block[(rows >= start) & (rows < stop)] = b
@@ -145,13 +147,22 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     scores = np.zeros((len(problem.fit_blocks), j.shape[1]))
     np.add.at(scores, blocks, js * r[:, None])
     moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
-    plain = bread * float(np.mean(r * r))
+    plain = bread @ data @ bread * float(np.mean(r * r))
     coloured = bread @ _coloured_meat(problem, js, r) @ bread if stride == 1 else plain
     idle = size < 1e-6 * np.sqrt(rows.size) / np.maximum(_ranges(fitted), 1e-300)
     scale = np.where(idle, 0.0, 1.0 / size)
     own = np.where(idle, (_ranges(fitted) / 3.92) ** 2, 0.0)
     both = np.outer(scale, scale)
     return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth))
+
+
+def _priors(fitted: Fit) -> Array:
+    """Return the precisions (parameters,) of the learned priors of the weights of effects, the noise being 1."""
+    out = np.zeros(fitted.theta.size)
+    for k, p in enumerate(fitted.model.placed):
+        if p.label in fitted.shrunk:
+            out[fitted.model.slices(k)[1]] = fitted.shrunk[p.label].precision
+    return out
 
 
 def few_blocks(moved: Array) -> Array:

@@ -49,11 +49,13 @@ def make_split(recording: Recording, held_out: float, seed: int, restart: bool) 
     if given is not None:
         return given_split(recording.n, *given, initialization=recording.split.initialization or 0)
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
+    outputs = np.column_stack([*recording.outputs.values()])
     guard = max(4, recording.n // 2000)
     begin = 0 if restart else int(UNKNOWN_START * recording.n)
     if "x0" in recording.twin.parameters or recording.twin.kind in ("state_space", "mechanical_axis"):
         begin = before_the_blow(recording, begin)
-    return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6, begin=begin)
+    segments = 3 if restart else 6
+    return own_split(signals, outputs, held_out=held_out, seed=seed, guard=guard, segments=segments, begin=begin)
 
 
 LEAST_MOVED = 0.06

@@ -7,7 +7,8 @@ outliers are bounded by Huber's weights.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,12 @@ from tools.mismatch.simulate import Model
 Array = NDArray[np.float64]
 
 HUBER = 4.0
+SHRUNK = 3
+"""Least number of weights that have a common prior. From three values on, estimates that are shrunk to a
+common centre are nearer to the truth than those of least squares, whatever it is (C. Stein, Proc. Third Berkeley
+Symp., 1956)."""
+EVIDENCE = 8
+"""Number of fixed-point steps to the prior variance of the weights."""
 
 
 def huber_weights(z: Array) -> Array:
@@ -30,6 +37,28 @@ def huber_weights(z: Array) -> Array:
 def robust_scale(r: Array, floor: float) -> float:
     """Return the robust scale of a residual, never below ``floor``."""
     return max(1.4826 * float(np.median(np.abs(r - np.median(r)))), floor, 1e-300)
+
+
+@dataclass(frozen=True)
+class Shrunk:
+    """Holds the learned prior of the weights of an effect.
+
+    ``precision`` (k,): reciprocal variances of the weights, the noise being 1; ``freedom``: number of weights that the
+    data determine, 0 to k.
+    """
+
+    precision: Array
+    freedom: float
+
+
+def _families(model: Model, which: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the places in ``which`` of each family of weights: those whose names differ in their number alone."""
+    found: dict[str, list[int]] = {}
+    for place, i in enumerate(which.tolist()):
+        name = model.parameters[i].name
+        if i >= model.n_base and name[-1:].isdigit():
+            found.setdefault(name.rstrip("0123456789"), []).append(place)
+    return [np.array(at, int) for at in found.values() if len(at) >= SHRUNK]
 
 
 class Projected:
@@ -48,6 +77,8 @@ class Projected:
         self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
         prior = belief(problem, model)
         self.centre, self.width = prior.centre, prior.width
+        self.ridge = np.zeros(len(model.parameters))
+        self.freedom = np.ones(len(model.parameters))
         self._name_parameters()
         self.evaluations = 0
 
@@ -64,6 +95,10 @@ class Projected:
         self.hi = np.array([model.parameters[j].hi for j in self.linear])
         believed = [i for i in range(model.n_base) if i in moving and np.isfinite(self.width[i])]
         self.believed = np.array(believed, int)
+        self.solved = _families(model, self.linear)
+        self.searched = _families(model, np.array(self.free, int))
+        places = [self.linear[at] for at in self.solved], [np.array(self.free, int)[at] for at in self.searched]
+        self.small = np.sort(np.concatenate([np.zeros(0, int), *places[0], *places[1]]))
 
     def only(self, outputs: Sequence[str]) -> tuple[Projected, NDArray[np.int64]]:
         """Return the residuals of ``outputs`` alone and their places; they share no linear parameter with others."""
@@ -72,7 +107,8 @@ class Projected:
         part._name_parameters()
         m, of_all = self.rows.size, len(self.outputs) * self.rows.size
         at = [np.arange(m) + m * i for i, o in enumerate(self.outputs) if o in part.outputs]
-        return part, np.concatenate([*at, of_all + np.flatnonzero(np.isin(self.believed, part.believed))])
+        priors = np.isin(np.r_[self.believed, self.small], np.r_[part.believed, part.small])
+        return part, np.concatenate([*at, of_all + np.flatnonzero(priors)])
 
     @property
     def usual_count(self) -> float:
@@ -87,22 +123,79 @@ class Projected:
             robust[self.problem.lively[self.rows]] = 1.0
             self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
 
-    def _from_belief(self, theta: Array) -> Array:
-        """Return the residuals of the prior: distances of base parameters from the engineer's own values."""
-        at = [to_search(self.model.parameters[i], float(theta[i])) for i in self.believed]
-        return (np.array(at) - self.centre[self.believed]) / self.width[self.believed]
-
-    def evaluate(self, theta: Array) -> tuple[Array, Array]:
-        """Return weighted residuals on the rows and theta with its linear part solved.
-
-        All outputs are joined, followed by the residuals of the prior.
+    def _from_priors(self, theta: Array) -> Array:
+        """Return the residuals of the priors: distances of base parameters from the engineer's own values, and of the
+        weights of an effect from zero.
         """
-        self.evaluations += 1
-        theta = theta.copy()
+        at = [to_search(self.model.parameters[i], float(theta[i])) for i in self.believed]
+        own = (np.array(at) - self.centre[self.believed]) / self.width[self.believed]
+        return np.r_[own, np.sqrt(self.ridge[self.small]) * theta[self.small]]
+
+    def shrink(self, theta: Array, jacobian: Callable[[Array, Array], Array]) -> None:
+        """Learn the priors of the weights of effects at ``theta``.
+
+        The weights of a family, each times the norm of its column, are normal about zero with a common variance. Many
+        collinear columns would otherwise follow the noise of a short recording. ``jacobian(theta, residual)``
+        returns the sensitivities of weights that are searched, because they are before a simulator.
+        """
+        if self.solved and (normal := self._normal(theta.copy())) is not None:
+            gram, cross, kept = normal
+            squares = sum(float(b @ b) for _, b, _ in kept), sum(b.size for _, b, _ in kept)
+            self._learn(self.linear, gram, cross, squares, self.solved, self._smoothness)
+        if self.searched:
+            residual, theta = self.evaluate(theta)
+            data = slice(0, residual.size - self.believed.size - self.small.size)
+            j, r = jacobian(theta, residual)[data], residual[data]
+            free = np.array(self.free, int)
+            inside = j @ np.array([to_search(self.model.parameters[i], theta[i]) for i in self.free]) - r
+            if np.all(np.isfinite(j)) and np.all(np.isfinite(r)):
+                squares = float(inside @ inside), r.size
+                self._learn(free, j.T @ j, j.T @ inside, squares, self.searched, lambda s: np.zeros((s.size, s.size)))
+
+    def _learn(
+        self, which: NDArray[np.int64], gram: Array, cross: Array, squares: tuple[float, int],
+        families: Sequence[NDArray[np.int64]], smoothness: Callable[[Array], Array],
+    ) -> None:  # fmt: skip
+        """Maximise the evidence of the priors of ``families`` of the parameters ``which`` (k,) by fixed-point steps.
+
+        ``gram`` (k, k) and ``cross`` (k,) of the weighted columns and values; ``squares``: sum of the squares of the
+        values, and their number (D. J. C. MacKay, Neural Computation 4, 1992, eq. 4.8).
+        """
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        data, target = gram / np.outer(size, size), cross / size
+        rough = smoothness(size)
+        precision, freedom = np.zeros(size.size), np.ones(size.size)
+        for _ in range(EVIDENCE):
+            covariance = np.linalg.pinv(data + rough + np.diag(precision + 1e-11), hermitian=True)
+            w = covariance @ target
+            seen = np.einsum("ij,ji->i", covariance, data)
+            noise = max((squares[0] - 2.0 * float(w @ target) + float(w @ data @ w)) / max(squares[1], 1), 1.0)
+            for at in families:
+                freedom[at] = np.clip(seen[at], 0.0, 1.0)
+                precision[at] = noise * float(np.sum(freedom[at])) / max(float(w[at] @ w[at]), 1e-300)
+        self.ridge[which] = precision * size**2
+        self.freedom[which] = freedom
+
+    def shrunk(self) -> dict[str, Shrunk]:
+        """Return the learned priors of the effects that have a family of weights."""
+        weights = {p.label: self.model.slices(k)[1] for k, p in enumerate(self.model.placed)}
+        return {
+            label: Shrunk(self.ridge[w], float(np.sum(self.freedom[w])))
+            for label, w in weights.items()
+            if np.any(self.ridge[w] > 0.0)
+        }
+
+    def _smoothness(self, size: Array) -> Array:
+        """Return the penalty of rough weights (k, k), each times the norm ``size`` (k,) of its column."""
+        if not np.any(self.penalty):
+            return np.zeros((size.size, size.size))
+        # rows are in units of weight and weak compared with the data
+        rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
+        return (rows.T @ rows) / np.outer(size, size)
+
+    def _normal(self, theta: Array) -> tuple[Array, Array, list[tuple[Array, Array, NDArray[np.int64]]]] | None:
+        """Return (gram, cross, (columns, values, places) per output) of the linear parameters; None if diverged."""
         design = self.model.design(self.view, theta, self.outputs, self.samples)
-        if self.linear.size == 0:
-            parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
-            return np.concatenate([*parts, self._from_belief(theta)]), theta
         k = self.linear.size
         gram = np.zeros((k, k))
         cross = np.zeros(k)
@@ -117,21 +210,33 @@ class Projected:
             cross[at] += a.T @ b
             kept.append((a, b, at))
         # a diverged plant has no finite cost, and LAPACK must not receive its values
-        runaway = np.full(sum(b.size for _, b, _ in kept) + self.believed.size, np.inf), theta
-        if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross))):
+        return (gram, cross, kept) if np.all(np.isfinite(gram)) and np.all(np.isfinite(cross)) else None
+
+    def evaluate(self, theta: Array) -> tuple[Array, Array]:
+        """Return weighted residuals on the rows and theta with its linear part solved.
+
+        All outputs are joined, followed by the residuals of the priors.
+        """
+        self.evaluations += 1
+        theta = theta.copy()
+        if self.linear.size == 0:
+            design = self.model.design(self.view, theta, self.outputs, self.samples)
+            parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
+            return np.concatenate([*parts, self._from_priors(theta)]), theta
+        runaway = len(self.outputs) * self.rows.size + self.believed.size + self.small.size
+        runaway = np.full(runaway, np.inf), theta
+        normal = self._normal(theta)
+        if normal is None:
             return runaway
-        # parameters of effects have no prior: their centre is zero and their width infinite
+        gram, cross, kept = normal
+        # of effects only the weights of a group have a prior
         centre = self.centre[self.linear]
         prior = 1.0 / self.width[self.linear] ** 2
-        gram[np.diag_indices(k)] += prior
+        gram[np.diag_indices_from(gram)] += prior
         cross += prior * centre
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        scaled = gram / np.outer(size, size)
-        if np.any(self.penalty):
-            # rows are in units of weight and weak compared with the data
-            rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
-            scaled = scaled + (rows.T @ rows) / np.outer(size, size)
-        scaled[np.diag_indices(k)] += 1e-11
+        scaled = gram / np.outer(size, size) + self._smoothness(size)
+        scaled[np.diag_indices_from(gram)] += 1e-11 + self.ridge[self.linear] / size**2
         target = cross / size + 1e-11 * size * centre
         if not (np.all(np.isfinite(scaled)) and np.all(np.isfinite(target))):
             return runaway
@@ -140,4 +245,4 @@ class Projected:
         except np.linalg.LinAlgError:
             solution = np.clip(np.linalg.lstsq(scaled, target, rcond=1e-10)[0] / size, self.lo, self.hi)
         theta[self.linear] = solution
-        return np.concatenate([*(b - a @ solution[at] for a, b, at in kept), self._from_belief(theta)]), theta
+        return np.concatenate([*(b - a @ solution[at] for a, b, at in kept), self._from_priors(theta)]), theta

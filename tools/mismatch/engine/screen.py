@@ -37,13 +37,16 @@ class Candidate:
 
 def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, ...]) -> list[Placed]:
     """Return every place that a candidate effect may take beside those present."""
-    out: list[Placed] = []
-    for effect in effects:
-        for place in sites(problem.twin, problem.recording, effect, present):
-            is_present = any(p.effect.name == effect.name and _same_place(p, place) for p in present)
-            if not is_present:
-                out.append(place)
-    return out
+    found = (place for effect in effects for place in sites(problem.twin, problem.recording, effect, present))
+    return [place for place in found if not any(_takes(p, place) for p in present)]
+
+
+def _takes(present: Placed, place: Placed) -> bool:
+    """Return True if ``place`` is taken: the same effect moves its outputs, or one is a case of the other there."""
+    if present.effect.name == place.effect.name:
+        return _same_place(present, place)
+    nested = present.effect.name == place.effect.plain or place.effect.name == present.effect.plain
+    return nested and (present.site, present.target) == (place.site, place.target)
 
 
 def _same_place(present: Placed, place: Placed) -> bool:

@@ -116,9 +116,10 @@ KNOTS = 10
 
 
 def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
-    """Return curves (m, k) of every input and condition and of the simulated ``output``.
+    """Return curves (m, k) of every input and condition and of the simulated ``output``, and all inputs together.
 
-    A curve of a condition stands alone and beside its product with the simulated output: a gain that follows it.
+    A curve of a condition stands alone and beside its product with the simulated output: a gain that follows it. Wrong
+    gains of several inputs follow all of them and none alone.
     """
     r = problem.recording
     simulated = problem.measured[output] - fitted.residual[output]
@@ -126,7 +127,8 @@ def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
     conditions = [c for x in r.context.values() if (c := curve(x[problem.index], KNOTS)).shape[1]]
     courses = [x[problem.index] for x in r.inputs.values()] + [simulated]
     plain = [c for x in courses if (c := curve(x, KNOTS)).shape[1]]
-    return [*plain, *conditions, *(np.column_stack([c, c * motion]) for c in conditions)]
+    gains = [np.column_stack([standard(x[problem.index]) for x in r.inputs.values()])] if len(r.inputs) > 1 else []
+    return [*plain, *gains, *conditions, *(np.column_stack([c, c * motion]) for c in conditions)]
 
 
 def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
@@ -137,7 +139,7 @@ def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
     return e - past @ np.linalg.lstsq(past[learned], clipped[learned], rcond=None)[0]
 
 
-def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed], int]) -> bool:
+def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed, Fit], float]) -> bool:
     """Return True if a curve of a recorded signal explains ``output`` better than its signal-independent effects.
 
     Such effects are a walk, steps and a drift in time. The curve counts with the colour of its residual, and each
@@ -163,7 +165,7 @@ def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Plac
     error, deviation = prediction(problem, fitted, output)
     e = error / deviation
     with_it = max(nats(e, deviation), nats(innovations(e, learned), deviation))
-    with_it -= one * sum(figures(fitted.model.placed[k]) for k in own)
+    with_it -= one * sum(figures(fitted.model.placed[k], fitted) for k in own)
     r = undone(problem, fitted, output, own)
     bare = max(with_it, nats(innovations(r - np.median(r[learned]), learned)))
     for columns in recorded(problem, fitted, output):

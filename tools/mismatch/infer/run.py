@@ -21,7 +21,7 @@ from tools.mismatch.engine.report import Alternative, Equivalent, Hold, Report, 
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.constants import Constants, learned
-from tools.mismatch.infer.decide import Answer, decide, recalibrated
+from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated
 from tools.mismatch.infer.sealed import score_sealed, seal
 from tools.mismatch.infer.search import Found, look, search
 from tools.mismatch.infer.store import Scored, Store
@@ -116,11 +116,10 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
 def least_named(store: Store) -> LeastNamed:
     """Return the thresholds of naming for the limits of detection.
 
-    They are the test of the effect, and the noise variances that pay its price and exceed the form error of others.
+    They are the test of the effect, and the noise variances that pay its price and the odds at which it is likely.
     """
     c = store.constants
-    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / store.count.noise)
-    least = max(pays, c.cut)
+    least = math.expm1(2.0 * (c.per_name + c.per_parameter + log_odds(LIKELY)) / store.count.noise)
     return LeastNamed(c.least_z, least / (1.0 + least))
 
 

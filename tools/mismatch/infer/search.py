@@ -127,7 +127,8 @@ class Search:
         # what a half of a pair leaves held out is noisy: how far each gets where it was fitted says more
         left = {s.key: sum(np.log(v) for v in fit_rms(self.store.problem, s.fitted).values()) for s in alone}
         alone.sort(key=lambda s: (left[s.key], sorted(s.key)))
-        for s in alone[:BEAM]:
+        best = {s.names: s for s in reversed(alone)}
+        for s in [s for s in alone if best[s.names] is s][:BEAM]:
             if self.moves:
                 self.moves -= 1
                 self.expand(s)
@@ -149,7 +150,10 @@ class Search:
             own_score = max((self.store.score(s) for s in here if name in s.names), default=np.inf)
             near = [s for s in here if self.store.score(s) > own_score - 2.0 * self.store.constants.per_name]
             rest = self.store.without(best, lambda p, n=name: p.effect.name == n)
-            for rival in list(dict.fromkeys(n for s in near for n in s.names if n not in best.names))[:RIVALS]:
+            # alone the general effect may stand for what another name explains beside its plain case
+            plain = [p.effect.plain for p in best.placed if p.effect.name == name]
+            rivals = dict.fromkeys([*plain, *(n for s in near for n in s.names)])
+            for rival in [n for n in rivals if n not in best.names][:RIVALS]:
                 grown, left = rest, set(outputs)
                 for s in (s for s in here if rival in s.names):
                     if left & set(s.placed[0].outputs):

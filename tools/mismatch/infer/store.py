@@ -126,7 +126,7 @@ class Store:
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
         free = self.count.noise / self.outputs * sum(w.free for w in every.values())
-        figures = free + sum(figures_of(e) for e in fitted.model.placed)
+        figures = free + sum(figures_of(e, fitted) for e in fitted.model.placed)
         return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
 
     def lawful(self, predictable: float) -> bool:
@@ -317,10 +317,12 @@ EVENTS = 2
 because the density pays for it sample by sample."""
 
 
-def figures_of(placed: Placed) -> int:
-    """Return the number of parameters that an effect brings."""
-    noise = placed.effect.predict is not None or placed.effect.claims is not None
-    return EVENTS if noise else size(placed)
+def figures_of(placed: Placed, fitted: Fit) -> float:
+    """Return the number of parameters that an effect brings: of many weights those that the data determine."""
+    if placed.effect.predict is not None or placed.effect.claims is not None:
+        return EVENTS
+    shrunk = fitted.shrunk.get(placed.label)
+    return size(placed) - (0.0 if shrunk is None else shrunk.precision.size - shrunk.freedom)
 
 
 def improper(fitted: Fit, placed: Placed) -> bool:
