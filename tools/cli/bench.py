@@ -10,7 +10,7 @@ from rich.text import Text
 
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
-from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, SeedOption, bench_path
 from tools.cli.common import clear_errors, console
 from tools.cli.run_watch import RateOption, ReferenceOption, WatchOption, check_twin, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
@@ -34,24 +34,20 @@ def bench(
         typer.Option(metavar="NAME", help="With --listen: host names under which the page is reached."),
     ] = None,
     recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for recordings.")] = Path("out/recordings"),
-    hand: Annotated[
-        str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
-    ] = None,
+    hand: HandOption = None,
     stale_ms: Annotated[
         float | None,
         typer.Option(
             min=1.0, max=1000.0, help="Time without scans, in ms, that ends the run; raise it on a busy machine."
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the emulated world.")] = None,
+    seed: SeedOption = None,
     watch: WatchOption = None,
     watch_reference: ReferenceOption = None,
     false_alarms_per_hour: RateOption = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
-    ] = False,
+    realtime: RealtimeOption = False,
 ) -> None:
     """Run the instrument and serve the bench page for it, until Ctrl-C.
 

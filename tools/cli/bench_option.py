@@ -1,4 +1,4 @@
-"""Defines ``--bench`` and ``--virtual``, the same in every command."""
+"""Defines the options of an emulated bench, the same in every command."""
 
 from __future__ import annotations
 
@@ -17,6 +17,19 @@ BenchOption = Annotated[
 ]
 VirtualOption = Annotated[
     bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
+]
+RealtimeOption = Annotated[
+    bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
+]
+HandOption = Annotated[
+    str | None, typer.Option("--hand", metavar="FILE", help="A recorded hand instead of the synthetic one.")
+]
+ScaleOption = Annotated[
+    float | None,
+    typer.Option("--scale", help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
+]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of the emulated world; default from the bench file.")
 ]
 
 

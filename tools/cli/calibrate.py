@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
-from tools.cli.calibrate_axes import Model, OnDrift
+from tools.cli.calibrate_actuation import Out
+from tools.cli.calibrate_axes import Gravity, Model, OnDrift
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.output import check_writable, write_calibration, write_json
 from tools.terminal import table_of
@@ -22,8 +23,6 @@ calibrate.command("positions")(calibrate_positions.positions)
 calibrate.command("piezo")(calibrate_actuation.piezo)
 calibrate.command("manipulator")(calibrate_actuation.manipulator)
 
-Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration file (TOML) that a bench can name.")]
-
 
 @calibrate.command("sensors")
 def sensors(
@@ -31,7 +30,7 @@ def sensors(
         Path, typer.Argument(metavar="TUMBLE", help="Recording of the resting instrument on two rotary stages.")
     ],
     out: Out,
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = 9.80131,
+    gravity: Gravity = 9.80131,
     model: Annotated[Model, typer.Option(help="Model: with cross-axis bias and scale factor, or the line alone.")] = (
         Model.COMPOSITE
     ),

@@ -41,6 +41,9 @@ class Model(StrEnum):
 
 
 Columns = Annotated[str, typer.Option(help="The three columns, with commas.")]
+Gravity = Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")]
+Rate = Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")]
+Result = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")]
 
 
 def three(columns: str) -> tuple[str, str, str]:
@@ -75,8 +78,8 @@ def accelerometer(
         Model, typer.Option(help="Model of --method stage: with cross-axis terms, or the line alone.")
     ] = Model.COMPOSITE,
     columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = STANDARD_GRAVITY,
-    rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
+    gravity: Gravity = STANDARD_GRAVITY,
+    rate_hz: Rate = None,
     counts_per_g: Annotated[
         float, typer.Option(min=1e-12, help="Nominal counts per g, for the methods fall and flat.")
     ] = 16384.0,
@@ -84,7 +87,7 @@ def accelerometer(
     drift: Annotated[
         OnDrift, typer.Option(help="What to do when the sensor still warms up at the first rest: refuse or fit.")
     ] = OnDrift.REFUSE,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
+    out: Result = None,
     json_file: JsonOption = None,
 ) -> None:
     """Fit bias, scale and misalignment of a three-axis accelerometer, with intervals, condition and missing poses.
@@ -192,7 +195,7 @@ def magnetometer(
     accelerometer_columns: Annotated[
         str | None, typer.Option(help="Columns of a calibrated accelerometer; they give the rotation to the body.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
+    out: Result = None,
     json_file: JsonOption = None,
 ) -> None:
     """Fit hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1; rotation to the body,

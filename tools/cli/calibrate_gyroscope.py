@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hal.types import STANDARD_GRAVITY
-from tools.cli.calibrate_axes import Columns, print_parameters, three
+from tools.cli.calibrate_axes import Columns, Gravity, Rate, Result, print_parameters, three
 from tools.cli.common import JsonOption, clear_errors
 from tools.output import check_writable, write_calibration, write_json
 
@@ -21,10 +21,10 @@ def gyroscope(
     ],
     columns: Columns = "gyro_x_raw,gyro_y_raw,gyro_z_raw",
     accelerometer_columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = STANDARD_GRAVITY,
-    rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
+    gravity: Gravity = STANDARD_GRAVITY,
+    rate_hz: Rate = None,
     shortest_s: Annotated[float, typer.Option(min=0.05, help="Shortest rest that is a pose.")] = 0.5,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
+    out: Result = None,
     json_file: JsonOption = None,
 ) -> None:
     """Fit scale, misalignment and bias of a gyroscope from still poses and the turns between them (Tedaldi).

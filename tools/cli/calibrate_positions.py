@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tools.cli.bench_option import bench_path
+from tools.cli.calibrate_axes import Rate
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.output import check_writable, write_calibration, write_json
 from tools.terminal import table_of
@@ -24,7 +25,7 @@ def positions(
         Path, typer.Option(metavar="FILE|NAME", help="Bench of the instrument; all but the positions is calibrated.")
     ],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Calibration file for the bench.")] = None,
-    rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
+    rate_hz: Rate = None,
     json_file: JsonOption = None,
 ) -> None:
     """Find the positions of the accelerometers with 95 % intervals; name the file under [firmware] calibration of the

@@ -30,7 +30,7 @@ from firmware_py.run_request import RunRequest
 from firmware_py.tremor.config import Method, all_methods
 from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
-from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, ScaleOption, SeedOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
@@ -55,9 +55,7 @@ def run(
     virtual: Annotated[
         bool, typer.Option("--virtual", help="Emulated bench: as fast as it can instead of a second per second.")
     ] = False,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
-    ] = False,
+    realtime: RealtimeOption = False,
     compiled: Annotated[
         bool, typer.Option("--compiled", help="Run the ticks in one compiled thread without the interpreter.")
     ] = False,
@@ -67,13 +65,8 @@ def run(
     cpu: Annotated[
         int | None, typer.Option(min=0, help="In real time: the processor that the loop stays on (isolcpus).")
     ] = None,
-    hand: Annotated[
-        str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
-    ] = None,
-    scale: Annotated[
-        float | None,
-        typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
-    ] = None,
+    hand: HandOption = None,
+    scale: ScaleOption = None,
     sense_only: Annotated[
         bool, typer.Option("--sense-only", help="Arm nothing; use it to record poses turned by hand, or raw sensors.")
     ] = False,
@@ -88,7 +81,7 @@ def run(
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="Another tremor estimator than the bench file's.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
+    seed: SeedOption = None,
     inject: Annotated[
         list[str] | None,
         typer.Option(

@@ -10,7 +10,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hal.bench import load_bench
-from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.bench_option import BenchOption, HandOption, ScaleOption, SeedOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.cli.run import complete_result
 from tools.errors import InputError
@@ -24,16 +24,12 @@ def simulate_command(
     *,
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=3.0, max=86_400.0, help="Simulated time after arming.")] = 60.0,
-    hand: Annotated[
-        str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
-    ] = None,
-    scale: Annotated[
-        float | None, typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz.")
-    ] = None,
+    hand: HandOption = None,
+    scale: ScaleOption = None,
     delay_us: Annotated[
         float | None, typer.Option(help="Delay from scan to command, in us; the default is that of the default bench.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
+    seed: SeedOption = None,
     json_file: JsonOption = None,
     image: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE", help="Picture (PNG) before and after.")
