@@ -1,6 +1,6 @@
 """Parameters and states of the kernels: numpy records with named fields, each declared once.
 
-``@record`` makes of an annotated class the layout in memory (``dtype_of``), the constructor (``new``) and the view that
+``@record`` makes of an annotated class the layout in memory, the constructor (``new``) and the view that
 kernels and the type checker see: an annotation ``state: WflcState`` is the record itself, ``Records[WflcState]`` the
 one-element array around it. Every number has a unit. A record crosses from Python into a kernel as one pointer,
 whatever it holds; the same numbers as separate arrays cost about 0.3 us each per call. A kernel writes
@@ -81,11 +81,6 @@ def _layout_of(hint: Any, declared: Declared, where: str) -> Any:
     if hasattr(inner, "__record__") and (inner is not hint) == bool(declared.shape):
         return inner
     raise TypeError(f"{where}: {hint} with shape {declared.shape} and unit '{declared.unit}' is no field of a record")
-
-
-def dtype_of(kind: type[Any], **sizes: int) -> np.dtype[Any]:
-    """Return the layout of a record whose named lengths are ``sizes``."""
-    return _dtype(kind, sizes, {})
 
 
 def _dtype(kind: type[Any], sizes: dict[str, int], values: dict[str, Any]) -> np.dtype[Any]:

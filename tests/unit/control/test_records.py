@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.records import Array, Integers, Records, attributes, dtype_of, field, new, record
+from firmware_py.records import Array, Integers, Records, attributes, field, new, record
 
 
 @record
@@ -33,7 +33,7 @@ class Whole(Base):
 
 
 def test_layout_is_as_declared_and_fields_of_the_base_come_first() -> None:
-    assert dtype_of(Whole, n=4) == np.dtype(
+    assert new(Whole, {"n": 4}).dtype == np.dtype(
         [
             ("count", "i8"),
             ("values", "f8", (2, 4)),
