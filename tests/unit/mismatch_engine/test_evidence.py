@@ -76,6 +76,23 @@ def test_friction_that_is_there_stays() -> None:
     assert withheld == ()
 
 
+def test_a_case_of_an_effect_does_not_stand_beside_it() -> None:
+    """Stribeck friction has Coulomb's in it; a loop at another place is another loop."""
+    problem, _, base = prepared(stage(3), 0.3, 0, False)
+    store = Store(problem, base, learned())
+    friction = [EFFECTS[n] for n in ("coulomb_friction", "stribeck_friction")]
+    for name, other in (("coulomb_friction", "stribeck_friction"), ("stribeck_friction", "coulomb_friction")):
+        present = [p for p in places(problem, friction, ()) if p.effect.name == name][:1]
+        assert other in {p.effect.name for p in places(problem, friction, ())}
+        assert not places(problem, friction, (*store.base.placed, *present))
+    loops = [EFFECTS[n] for n in ("hysteresis", "backlash")]
+    free = places(problem, loops, ())
+    loop = next(p for p in free if p.effect.name == "hysteresis" and p.site == "output")
+    beside = {(p.effect.name, p.site) for p in places(problem, loops, (loop,))}
+    assert ("backlash", "output") not in beside
+    assert ("backlash", "input") in beside
+
+
 @pytest.mark.parametrize(
     ("seed", "coulomb"), [(0, 0.0), *(pytest.param(s, c, marks=pytest.mark.slow) for s in (1, 2) for c in (0.0, 0.2))]
 )

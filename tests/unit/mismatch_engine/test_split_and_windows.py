@@ -31,6 +31,17 @@ def test_own_split_leaves_the_beginning_out() -> None:
     assert split.fit[0][0] == 90
 
 
+def test_what_a_slow_output_did_once_is_fitted() -> None:
+    """A decay from a start far away: without it the held-out part would ask how the physics extrapolates."""
+    rng = np.random.default_rng(2)
+    inputs, decay = rng.standard_normal((600, 1)), np.exp(-np.arange(600) / 60)[:, None]
+    for seed in range(20):
+        held = own_split(inputs, decay, seed=seed, begin=18).held_out_mask()
+        assert decay[held].max() < decay[18:][~held[18:]].max()
+    (a, _) = own_split(inputs, seed=0, guard=4, begin=18).held_out[0]
+    assert a - 4 >= 18 + (100 - 30 - 22) // 4
+
+
 def test_given_split_is_honoured() -> None:
     split = given_split(1000, (0, 600), (600, 1000), initialization=20)
     assert split.fit == ((0, 600),)

@@ -61,6 +61,31 @@ def _families(model: Model, which: NDArray[np.int64]) -> list[NDArray[np.int64]]
     return [np.array(at, int) for at in found.values() if len(at) >= SHRUNK]
 
 
+def evidence(
+    gram: Array, cross: Array, squares: tuple[float, int], families: Sequence[NDArray[np.int64]],
+    rough: Callable[[Array], Array],
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return the precisions (k,) of the priors that maximise the evidence, and the share (k,) of each weight that the
+    data determine, for ``families`` of weights; of all others 0 and 1.
+
+    ``gram`` (k, k) and ``cross`` (k,) of the columns and values in noise units; ``squares``: sum of the squares of the
+    values, and their number; ``rough`` returns a further penalty (k, k) from the norms (k,) of the columns. Weights
+    times the norm of their column are alike (D. J. C. MacKay, Neural Computation 4, 1992, eq. 4.8).
+    """
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    data, target, penalty = gram / np.outer(size, size), cross / size, rough(size)
+    precision, freedom = np.zeros(size.size), np.ones(size.size)
+    for _ in range(EVIDENCE):
+        covariance = np.linalg.pinv(data + penalty + np.diag(precision + 1e-11), hermitian=True)
+        w = covariance @ target
+        seen = np.einsum("ij,ji->i", covariance, data)
+        noise = max((squares[0] - 2.0 * float(w @ target) + float(w @ data @ w)) / max(squares[1], 1), 1.0)
+        for at in families:
+            freedom[at] = np.clip(seen[at], 0.0, 1.0)
+            precision[at] = noise * float(np.sum(freedom[at])) / max(float(w[at] @ w[at]), 1e-300)
+    return precision * size**2, freedom
+
+
 class Projected:
     """Computes residuals as a function of the nonlinear parameters alone."""
 
@@ -141,40 +166,17 @@ class Projected:
         if self.solved and (normal := self._normal(theta.copy())) is not None:
             gram, cross, kept = normal
             squares = sum(float(b @ b) for _, b, _ in kept), sum(b.size for _, b, _ in kept)
-            self._learn(self.linear, gram, cross, squares, self.solved, self._smoothness)
+            found = evidence(gram, cross, squares, self.solved, self._smoothness)
+            self.ridge[self.linear], self.freedom[self.linear] = found
         if self.searched:
             residual, theta = self.evaluate(theta)
             data = slice(0, residual.size - self.believed.size - self.small.size)
             j, r = jacobian(theta, residual)[data], residual[data]
-            free = np.array(self.free, int)
             inside = j @ np.array([to_search(self.model.parameters[i], theta[i]) for i in self.free]) - r
             if np.all(np.isfinite(j)) and np.all(np.isfinite(r)):
                 squares = float(inside @ inside), r.size
-                self._learn(free, j.T @ j, j.T @ inside, squares, self.searched, lambda s: np.zeros((s.size, s.size)))
-
-    def _learn(
-        self, which: NDArray[np.int64], gram: Array, cross: Array, squares: tuple[float, int],
-        families: Sequence[NDArray[np.int64]], smoothness: Callable[[Array], Array],
-    ) -> None:  # fmt: skip
-        """Maximise the evidence of the priors of ``families`` of the parameters ``which`` (k,) by fixed-point steps.
-
-        ``gram`` (k, k) and ``cross`` (k,) of the weighted columns and values; ``squares``: sum of the squares of the
-        values, and their number (D. J. C. MacKay, Neural Computation 4, 1992, eq. 4.8).
-        """
-        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        data, target = gram / np.outer(size, size), cross / size
-        rough = smoothness(size)
-        precision, freedom = np.zeros(size.size), np.ones(size.size)
-        for _ in range(EVIDENCE):
-            covariance = np.linalg.pinv(data + rough + np.diag(precision + 1e-11), hermitian=True)
-            w = covariance @ target
-            seen = np.einsum("ij,ji->i", covariance, data)
-            noise = max((squares[0] - 2.0 * float(w @ target) + float(w @ data @ w)) / max(squares[1], 1), 1.0)
-            for at in families:
-                freedom[at] = np.clip(seen[at], 0.0, 1.0)
-                precision[at] = noise * float(np.sum(freedom[at])) / max(float(w[at] @ w[at]), 1e-300)
-        self.ridge[which] = precision * size**2
-        self.freedom[which] = freedom
+                found = evidence(j.T @ j, j.T @ inside, squares, self.searched, lambda s: np.zeros((s.size, s.size)))
+                self.ridge[self.free], self.freedom[self.free] = found
 
     def shrunk(self) -> dict[str, Shrunk]:
         """Return the learned priors of the effects that have a family of weights."""
