@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
+from threadpoolctl import threadpool_limits
 
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.piezo_dynamics import MAX_LAG_S, Dynamics, delayed, fit_dynamics
@@ -43,7 +44,15 @@ FIT_SHARE = 0.7
 
 
 def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
-    """Fit one stack to recordings of kind ``piezo_stack``. Raises ``InputError`` when it cannot be."""
+    """Fit one stack to recordings of kind ``piezo_stack``. Raises ``InputError`` when it cannot be.
+
+    The linear algebra uses one thread: the matrices are narrow, and a second thread waits more than it works.
+    """
+    with threadpool_limits(1):
+        return _identify_stack(recordings)
+
+
+def _identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not given:
         raise InputError("no recording was given")

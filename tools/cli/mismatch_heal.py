@@ -18,7 +18,9 @@ def heal(
         "healed"
     ),
     seconds: Annotated[float, typer.Option(min=5.0, max=600.0, help="Length of each run that decides.")] = 12.0,
-    runs: Annotated[int, typer.Option(min=3, max=100, help="Runs that decide, each with a hand of its own.")] = 8,
+    runs: Annotated[
+        int, typer.Option(min=3, max=100, help="Runs that try a remedy, each with its hand; twice as many decide.")
+    ] = 8,
     max_effect: Annotated[
         int | None, typer.Option(min=0, max=4, help="On a real bench: 4 may move the outputs.")
     ] = None,
@@ -26,7 +28,7 @@ def heal(
 ) -> None:
     """Measure each part of a bench, put right what the firmware believes of it, and keep what helps the tip.
 
-    A remedy is kept when runs with other hands and noise have less error from 2 to 500 Hz, and no more below.
+    A remedy is kept when runs with other hands and noise have less error at 8-12 Hz or 2-500 Hz, and no band has more.
 
     Example: micron mismatch heal benches/micron.toml --out healed
     """

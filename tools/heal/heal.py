@@ -13,14 +13,20 @@ from sim_devices.config import emulation_config
 from tools.bench.bench_copy import with_calibration
 from tools.closed_loop.simulate import COMMAND_DELAY_S, wires_of
 from tools.errors import InputError
+from tools.heal.balance import Balance, is_weighed, next_balance
 from tools.heal.experiments import StackTwin, twin_of_stack
-from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
+from tools.heal.figures import BANDS, WHOLE, TipError, is_better, is_worth_trying, rises, tip_error
 from tools.heal.parts import PARTS, Comparison, Lab, Part
 from tools.heal.without_remedy import WITHOUT_REMEDY
 from tools.output import write_text_atomic
 
-VERIFY_FROM = 1000
-"""First seed of the runs that decide; the bench's own seed drew the experiments."""
+TRY_FROM, VERIFY_FROM = 1000, 5000
+"""First seeds of the runs on which a remedy is tried, and of those that decide if it is kept. The bench's own seed drew
+the experiments."""
+VERIFY_RUNS = 2
+"""Number of runs that decide for each run on which a remedy is tried."""
+NO_RISE = 0.5
+"""Level at which a band counts as risen on the runs where a remedy is tried: its mean must not rise at all."""
 STACK_EFFECTS = frozenset(
     (
         "hysteresis", "rate_dependent_hysteresis", "creep", "backlash", "dead_zone", "static_nonlinearity",
@@ -37,7 +43,8 @@ class Step:
     """Records the treatment of a part: misfit, effects that the engine named, and if and why its remedy was kept.
 
     ``no_remedy`` lists what was found that the firmware cannot compensate, ``split`` those for which an experiment
-    was planned and played. ``twin`` is the corrected twin of the stack that differed most.
+    was planned and played. ``twin`` is the corrected twin of the stack that differed most. ``balance`` states the new
+    weights of the tremor estimator, "" where they stay.
     """
 
     part: str
@@ -50,11 +57,12 @@ class Step:
     after: Mapping[str, float]
     twin: str | None = None
     split: tuple[str, ...] = ()
+    balance: str = ""
 
 
 @dataclass(frozen=True)
 class Healed:
-    """Holds the mean tip error (um) by band ``before`` and ``after`` over the same seeds, and the healed file."""
+    """Holds the mean tip error (um) by band ``before`` and ``after`` over deciding seeds, and the healed file."""
 
     original: str
     bench: str | None
@@ -97,10 +105,15 @@ def heal(
     say: Say,
     parts: Sequence[Part] = PARTS,
 ) -> Healed:
-    """Heal the emulated bench ``path``; the healed copy and all recordings go to the folder ``out``."""
+    """Heal the emulated bench ``path``; the healed copy and all recordings go to the folder ``out``.
+
+    A remedy is tried on ``runs`` runs, and kept if ``VERIFY_RUNS`` times as many others have less error and no band in
+    which it rises (``is_better``).
+    """
     original = load_bench(path)
     config = emulation_config(original.description.model_dump())
-    seeds = tuple(range(VERIFY_FROM, VERIFY_FROM + runs))
+    trial = Trial(seconds, range(TRY_FROM, TRY_FROM + runs))
+    seeds = tuple(range(VERIFY_FROM, VERIFY_FROM + VERIFY_RUNS * runs))
     before = now = tip_error(original, seconds, seeds)
     bench, steps = original, list[Step]()
     for part in parts:
@@ -115,21 +128,23 @@ def heal(
             say(f"{part.name}: the twin of stack {compared.axis + 1}")
             twin = twin_of_stack(lab, compared.axis, jobs)
         say(f"{part.name}: identifying")
+        remedy = Remedy(out / f"{part.name}.toml", out / f"weights-{part.name}.toml", out / f"bench-{part.name}.toml")
+        balance = Balance()
         try:
-            file = out / f"{part.name}.toml"
-            write_text_atomic(file, part.identify(lab).read_text())
-            candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
-            after = tip_error(candidate, seconds, seeds)
+            write_text_atomic(remedy.file, part.identify(lab).read_text())
+            candidate, balance, why = trial.run(bench, remedy)
+            after, kept = now, False
+            if candidate is not None:
+                say(f"{part.name}: verifying")
+                after = tip_error(candidate, seconds, seeds)
+                kept, why = is_better(now, after)
         except InputError as error:
-            steps.append(_step(part, compared, named, (False, str(error)), now, twin))
-            continue
-        kept, why = is_better(now, after)
-        steps.append(_step(part, compared, named, (kept, why), after, twin))
-        if kept:
+            candidate, after, kept, why = None, now, False, str(error)
+        steps.append(_step(part, compared, named, (kept, why), after, twin, balance))
+        if kept and candidate is not None:
             bench, now = candidate, after
         else:
-            candidate.path.unlink()
-            file.unlink()
+            remedy.remove()
     return Healed(
         str(path),
         None if bench is original else str(bench.path),
@@ -139,6 +154,57 @@ def heal(
         now.mean(),
         tuple(steps),
     )
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """Names the files of a remedy: calibration, weights of the tremor estimator, and the bench with both."""
+
+    file: Path
+    weights: Path
+    bench: Path
+
+    def apply(self, to: BenchFile, balance: Balance) -> BenchFile:
+        """Return the bench ``to`` with the calibration in ``file`` and the estimator's weights as ``balance`` says."""
+        healed = with_remedy(to, self.file, self.bench)
+        if balance == Balance():
+            return healed
+        write_text_atomic(self.weights, balance.calibration(healed))
+        return load_bench(with_calibration(healed, self.weights.resolve(), self.bench))
+
+    def remove(self) -> None:
+        """Delete the files."""
+        for file in (self.file, self.weights, self.bench):
+            file.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Tries remedies on runs that do not decide: ``seconds`` long, one for each of ``seeds``."""
+
+    seconds: float
+    seeds: Sequence[int]
+
+    def run(self, bench: BenchFile, remedy: Remedy) -> tuple[BenchFile | None, Balance, str]:
+        """Return the bench with the remedy, and the first balance with which no band rises; None and why if none is.
+
+        The remedy must help with the estimator as it is: other weights alone are no reason to keep it.
+        """
+        before = tip_error(bench, self.seconds, self.seeds)
+        balance = Balance()
+        while True:
+            candidate = remedy.apply(bench, balance)
+            after = tip_error(candidate, self.seconds, self.seeds)
+            is_worth_it, why = is_worth_trying(before, after)
+            rising = rises(before, after, NO_RISE)
+            if not is_worth_it:
+                return None, balance, why
+            if not rising:
+                return candidate, balance, why
+            following = next_balance(balance, rising) if is_weighed(bench) else None
+            if following is None:
+                return None, balance, f"{why}, but {', '.join(rising.values())}"
+            balance = following
 
 
 def with_remedy(bench: BenchFile, file: Path, out: Path) -> BenchFile:
@@ -175,11 +241,12 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
 
 def _step(
     part: Part, compared: Comparison, named: tuple[tuple[str, ...], tuple[str, ...]], verdict: tuple[bool, str],
-    after: TipError, twin: StackTwin | None,
+    after: TipError, twin: StackTwin | None, balance: Balance,
 ) -> Step:  # fmt: skip
     file = str(twin.file) if twin is not None and twin.file is not None else None
     split = twin.split if twin is not None else ()
-    return Step(part.name, compared.rms, compared.unit, *named, *verdict, after.mean(), file, split)
+    weights = "" if balance == Balance() else str(balance)
+    return Step(part.name, compared.rms, compared.unit, *named, *verdict, after.mean(), file, split, weights)
 
 
 def lines(healed: Healed) -> list[str]:
@@ -193,7 +260,8 @@ def lines(healed: Healed) -> list[str]:
             out.append(f"  planned and recorded: what splits {', '.join(s.split).replace('_', ' ')}.")
         if s.twin is not None:
             out.append(f"  corrected twin of the stack: {s.twin}")
-        out.append(f"  {'kept' if s.kept else 'reverted'}: {s.why}.")
+        weights = f" (tremor estimator: {s.balance})" if s.balance else ""
+        out.append(f"  {'kept' if s.kept else 'reverted'}: {s.why}{weights}.")
     out.append(f"tip error, um rms, mean of {len(healed.seeds)} runs of {healed.seconds:g} s")
     out += [f"  {b:12} {healed.before[b]:8.3f} -> {healed.after[b]:8.3f}" for b in (*BANDS, WHOLE)]
     return out

@@ -103,7 +103,10 @@ def run_one(
         told = (change.told[0], change.told[1].format(x=x, ms=0.0017 + 1e-3 * x))
         known = tip_error(load_bench(write_bench(folder / "known.toml", seed, table, told)), seconds, judges)
     steps = [
-        {k: getattr(s, k) for k in ("part", "difference", "unit", "effects", "no_remedy", "split", "kept", "why")}
+        {
+            k: getattr(s, k)
+            for k in ("part", "difference", "unit", "effects", "no_remedy", "split", "kept", "why", "balance")
+        }
         for s in found.steps
     ]
     return {
@@ -154,15 +157,21 @@ def page(rows: Sequence[dict[str, Any]], seconds: float) -> str:
     worse = [f"{r['change']}: {', '.join(r['worse'])}" for r in rows if r["worse"]]
     missing = [name for name in CHANGES if name not in {r["change"] for r in rows}]
     reverted = [f"{r['change']}, {s['part']}: {s['why']}" for r in rows for s in r["steps"] if not s["kept"]]
-    kept = [f"{r['change']}, {s['part']}: {s['why']}" for r in rows for s in r["steps"] if s["kept"]]
+    kept = [
+        f"{r['change']}, {s['part']}: {s['why']}{s['balance'] and '; tremor estimator: '}{s['balance']}"
+        for r in rows
+        for s in r["steps"]
+        if s["kept"]
+    ]
     return f"""# Benches that were healed
 
 Made by `python -m tools.research.prove.heal_measure --seed {seed} --keep FOLDER --out docs/results/heal.json`,
 revision {revisions}; do not edit. Tip error in um rms against the intended path, before -> after `micron mismatch heal`
-(with the physics known): mean of {JUDGES} runs of {seconds:g} s whose hands did not decide. Known is the changed bench
-with the firmware told of the filter or the delay; else the unchanged bench, which no compensation can reach where
-there is no remedy. A run without wires: the amplifier's monitor, which stops the instrument at its tolerance of 0.3 V,
-is not in it.
+(with the physics known): mean of {JUDGES} runs of {seconds:g} s whose hands neither tried a remedy nor decided. Known
+is the changed bench with the firmware told of the filter or the delay; else the unchanged bench, which no compensation
+can reach where there is no remedy. Both have the estimator's weights of the bench that ships; heal may change them
+beside a remedy. A run without wires: the amplifier's monitor, which stops the instrument at its tolerance of 0.3 V, is
+not in it.
 
 {table(rows)}
 
