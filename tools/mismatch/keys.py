@@ -39,7 +39,12 @@ CHANNEL = (
     Key("role", "input, output, context", "drives the twin, is compared with it, or was recorded beside"),
     Key("signal", "text", "the twin's own name for it (below)"),
     Key("unit", "text", "SI or another of its dimension (mV, um, deg/s, G, mg, ...)", "the file's, else the twin's"),
-    Key("noise_rms", "number > 0", "of an output: rms noise of the instrument, in unit", "estimated"),
+    Key(
+        "noise_rms",
+        "number > 0",
+        "rms noise of the instrument that measured an output or input, in unit",
+        "of an output: estimated; of an input: none",
+    ),
     Key("resolution", "number > 0", "of an output: smallest step of the readings, in unit", "found in the data"),
     Key("tolerance", "number > 0", "of an output: smaller differences do not matter to you, in unit", "none"),
 )

@@ -60,7 +60,8 @@ class Part:
 class Recording:
     """Holds all columns, float64 (n,), in the contract's units, uniformly sampled.
 
-    ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
+    ``noise``: declared rms noise of an output in its contract unit, or None. ``input_noise``: declared rms noise of the
+    measured inputs, whose columns are conditional means (``input_noise.py``). ``unit``: the contract unit of each
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
     ``tolerance``: differences of an output that do not matter to the user, in its contract unit. ``segments``: samples
     other than the first at which a new run begins: plants with states restart there. ``conditions``: the table
@@ -90,6 +91,7 @@ class Recording:
     parts: tuple[Part, ...] = ()
     per_recording: tuple[str, ...] = ()
     levels: tuple[tuple[float, ...], ...] = ()
+    input_noise: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def file_unit(self) -> dict[str, str]:

@@ -15,6 +15,7 @@ import numpy as np
 from hal.trust import path_inside
 from tools.errors import RecordingError
 from tools.mismatch import units
+from tools.mismatch.input_noise import conditional_mean
 from tools.mismatch.recording import Array, Condition, Recording, Split, TwinText
 from tools.mismatch.recording_columns import SUFFIXES, column_units, read_columns
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
@@ -111,7 +112,9 @@ def from_table(
     else:
         assert rate is not None
         dt = 1.0 / rate
+    segments = _segments(path, text.get("segments"), n, twin.kind, grid is not None)
     parts: dict[str, dict[str, Array]] = {"input": {}, "output": {}, "context": {}}
+    input_noise: dict[str, float] = {}
     for c in channels:
         values = units.convert(columns[c.column], c.unit, c.to)
         size = float(np.max(np.abs(values)))
@@ -126,6 +129,9 @@ def from_table(
                     " sample 0 to the end; a dead sensor or the wrong column"
                 )
             notes.append(f"column '{c.column}' ({c.role} '{c.signal}') never changes")
+        if c.role == "input" and c.noise is not None:
+            input_noise[c.signal] = units.convert_difference(c.noise, c.unit, c.to)
+            values = conditional_mean(values, input_noise[c.signal], segments)
         parts[c.role][c.signal] = values
     _same_data(data_path, channels, columns, notes)
     recording = Recording(
@@ -153,7 +159,8 @@ def from_table(
             c.signal: units.convert_difference(c.tolerance, c.unit, c.to) for c in channels if c.tolerance is not None
         },
         warnings=tuple(notes),
-        segments=_segments(path, text.get("segments"), n, twin.kind, grid is not None),
+        segments=segments,
+        input_noise=input_noise,
         conditions=_conditions(where, text.get("conditions")),
     )
     if twin.kind == "state_space":
@@ -268,8 +275,8 @@ def _channels(
         unit, to = _unit(at, entry.get("unit", in_file.get(column)), allowed, signal, notes)
         noise = _positive(at, "noise_rms", entry.get("noise_rms"))
         step = _positive(at, "resolution", entry.get("resolution"))
-        if noise is not None and role != "output":
-            notes.append(f"[[channels]] {i + 1}: noise_rms of a channel that is no output is not used")
+        if noise is not None and role == "context":
+            notes.append(f"[[channels]] {i + 1}: noise_rms of a context channel is not used")
         tolerance = _positive(at, "tolerance", entry.get("tolerance"))
         if tolerance is not None and role != "output":
             notes.append(f"[[channels]] {i + 1}: tolerance of a channel that is no output is not used")

@@ -46,6 +46,7 @@ def read_in(recording: Recording, to: dict[str, str]) -> Recording:
         inputs=moved(dict(recording.inputs)),
         outputs=moved(dict(recording.outputs)),
         noise={s: None if v is None else size(s, v) for s, v in recording.noise.items()},
+        input_noise={s: size(s, v) for s, v in recording.input_noise.items()},
         declared_step={s: size(s, v) for s, v in recording.declared_step.items()},
         tolerance={s: size(s, v) for s, v in recording.tolerance.items()},
         unit={s: to.get(s, u) for s, u in recording.unit.items()},

@@ -11,7 +11,7 @@ upper bound then follows from the part of the residual that follows signals (``f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,9 @@ class NoiseFloor:
 
     ``rms`` is the whole noise and ``standard_error`` its error; ``white_rms`` is the flat part (equal to ``rms`` unless
     the noise is coloured); ``step`` is the quantisation step of the samples, 0 if none is visible; ``method`` is one of
-    declared, repeats, rest, spectrum; ``coloured`` is True if the spectrum falls up to its end. ``most`` is the upper
-    bound from periods or stretches at rest (infinite without any).
+    declared, repeats, rest, spectrum, inputs (most of it is what the noise of the inputs does); ``coloured`` is True if
+    the spectrum falls up to its end. ``most`` is the upper bound from periods or stretches at rest (infinite without
+    any).
     """
 
     rms: float
@@ -45,6 +46,19 @@ class NoiseFloor:
     @property
     def declared(self) -> bool:
         return self.method == "declared"
+
+    def with_inputs(self, rms: float) -> NoiseFloor:
+        """Return the noise with that of the inputs, which moves the output by ``rms``."""
+        if rms <= 0.0:
+            return self
+        both, is_most = float(np.hypot(self.rms, rms)), rms > self.rms
+        return replace(
+            self,
+            rms=both,
+            standard_error=float(np.hypot(self.standard_error, 0.1 * rms)),
+            method="inputs" if is_most else self.method,
+            most=float(np.hypot(self.most, KNOWN_WITHIN * rms)),
+        )
 
 
 def clip_spikes(e: Array, threshold: float = 15.0) -> Array:

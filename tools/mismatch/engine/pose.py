@@ -23,6 +23,7 @@ from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.screen import Candidate
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
 from tools.mismatch.engine.trust import stayed
+from tools.mismatch.input_noise import error_of_mean
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
@@ -119,6 +120,7 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
         with np.errstate(all="ignore"):
             simulated = base.model.simulate(View.whole(rec, problem.init), base.theta)
         whole = {o: rec.outputs[o] - y for o, y in simulated.items() if np.all(np.isfinite(y))}
+    moved = moved_by_input_noise(problem, base)
     floors = {}
     for o in problem.twin.outputs:
         longest = max(problem.fit_spans + problem.held_spans, key=lambda s: s[1] - s[0])
@@ -131,7 +133,25 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
         again = repeated_noise(rec, o) if rec.noise.get(o) is None else None
         if again is not None:
             floors[o] = replace(floors[o], rms=again, white_rms=min(floors[o].white_rms, again), method="repeats")
+        floors[o] = floors[o].with_inputs(moved.get(o, 0.0))
     return problem.with_floors(floors)
+
+
+def moved_by_input_noise(problem: Problem, base: Fit) -> dict[str, float]:
+    """Return the rms by which the error of inputs with declared noise moves each output; none for exact inputs."""
+    rec = problem.recording
+    if not rec.input_noise:
+        return {}
+    rng = np.random.default_rng([problem.seed, rec.n])
+    shaken = {
+        s: x + error_of_mean(x, rec.input_noise[s], rng) if s in rec.input_noise else x for s, x in rec.inputs.items()
+    }
+    with np.errstate(all="ignore"):
+        one, two = (
+            base.model.simulate(View.whole(r, problem.init), base.theta) for r in (rec, replace(rec, inputs=shaken))
+        )
+        found = {o: float(np.std(two[o] - one[o])) for o in one}
+    return {o: v for o, v in found.items() if np.isfinite(v)}
 
 
 @dataclass(frozen=True)
