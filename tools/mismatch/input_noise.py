@@ -9,11 +9,13 @@ there gains nothing (regression calibration: Carroll et al. 2006, chapter 4).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
 from scipy.ndimage import uniform_filter1d
+from scipy.signal import lfilter, lfiltic
 
 Array = NDArray[np.float64]
 WIDTHS = (15, 31, 63, 127, 255)
@@ -21,6 +23,8 @@ WIDTHS = (15, 31, 63, 127, 255)
 SHRINK = 4.505
 """Noise that a block of frequencies pays, in its expected power (Cai 1999, section 3)."""
 LEAST_SAMPLES = 64
+CONTINUED, ORDER = 8, 32
+"""Share of a record by which it is continued at each end, as an inverse, and the order of the autoregression."""
 
 
 def conditional_mean(measured: Array, noise_rms: float, starts: Sequence[int] = ()) -> Array:
@@ -31,8 +35,9 @@ def conditional_mean(measured: Array, noise_rms: float, starts: Sequence[int] = 
     out = measured.copy()
     for run in np.split(np.arange(measured.size), list(starts)):
         if run.size >= LEAST_SAMPLES:
-            course = _cosines(measured[run])
-            out[run] = _course(_best_gains(course, noise_rms) * course)
+            wide, inner = _extended(measured[run])
+            course = _cosines(wide)
+            out[run] = _course(_best_gains(course, noise_rms) * course)[inner]
     return out
 
 
@@ -43,14 +48,43 @@ def error_of_mean(expected: Array, noise_rms: float, rng: np.random.Generator) -
     mean, and the error has ``S N / (S + N)``.
     """
     noise = noise_rms**2
-    power = _smooth(_cosines(expected) ** 2, WIDTHS[0])
+    wide, inner = _extended(expected)
+    power = _smooth(_cosines(wide) ** 2, WIDTHS[0])
     course = 0.5 * (power + np.sqrt(power**2 + 4.0 * power * noise))
-    white = noise_rms * rng.standard_normal(expected.size)
-    return _course(np.sqrt(course / (course + noise)) * white)
+    white = noise_rms * rng.standard_normal(wide.size)
+    return _course(np.sqrt(course / (course + noise)) * white)[inner]
+
+
+def _extended(x: Array) -> tuple[Array, slice]:
+    """Return ``x`` (n,) with its continuation at both ends, and the samples that are its own.
+
+    Cosines would go on mirrored, with a kink at each end. The continuation is that of an autoregression (Burg 1967).
+    """
+    count, mean = x.size // CONTINUED, float(np.mean(x))
+    away = x - mean
+    a = _burg(away, min(ORDER, x.size // 4))
+
+    def following(y: Array) -> Array:
+        state: Any = lfiltic([1.0], a, y[::-1][: a.size - 1])
+        return np.asarray(lfilter([1.0], a, np.zeros(count), zi=state)[0], np.float64)
+
+    wide = np.concatenate([following(away[::-1])[::-1], away, following(away)])
+    return wide + mean, slice(count, count + x.size)
+
+
+def _burg(x: Array, order: int) -> Array:
+    """Return the coefficients (order + 1,) of a stable autoregression, the first of which is 1."""
+    ahead, back, a = x, x, np.ones(1)
+    for _ in range(order):
+        f, b = ahead[1:], back[:-1]
+        k = -2.0 * float(f @ b) / max(float(f @ f + b @ b), 1e-300)
+        ahead, back = f + k * b, b + k * f
+        a = np.append(a, 0.0)
+        a = a + k * a[::-1]
+    return a
 
 
 def _cosines(x: Array) -> Array:
-    # the course goes on mirrored: a step from its last sample to its first would spread over all frequencies
     return np.asarray(dct(x, norm="ortho"), np.float64)
 
 
