@@ -86,6 +86,10 @@ noise_rms = 0.02
 `hold = "zero"` says that a computer held the force over each sample. Without it the report names friction here, and the
 verdict is `unexplained`. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
 
+Name the commanded value as input where there is one. An input that was measured has noise, and an effect that smooths
+it (a lag, a resonance) then predicts better although the machine has none: state its `noise_rms`, too. The tool then
+uses what is expected of the input given its whole course, and counts what is left of its noise as noise of the output.
+
 ## 2. Diagnose, correct, run again
 
 `micron mismatch diagnose` reports where recording and twin differ and which physics is missing
