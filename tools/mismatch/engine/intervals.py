@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +77,7 @@ class Uncertainty:
     ``moved`` (blocks, parameters): shift of the parameters by each block of the data; ``plain`` and ``coloured``
     (parameters, parameters): their covariance for a white residual, and for one with the spectrum of its
     autoregression; ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form
-    of the model.
+    of the model. ``whole`` has, for every effect that has only weights, the variance of a factor of all of them.
     """
 
     moved: Array
@@ -84,6 +85,7 @@ class Uncertainty:
     coloured: Array
     own: Array
     beyond: float
+    whole: Mapping[int, float]
 
     def spread(self, gradients: Array) -> Array:
         """Return standard deviations (k,) of quantities with these ``gradients`` (k, parameters).
@@ -95,24 +97,12 @@ class Uncertainty:
         accounts += [np.einsum("ij,jk,ik->i", gradients, c, gradients) for c in (self.plain, self.coloured)]
         return np.sqrt(np.maximum(np.max(accounts, axis=0), 0.0) * self.beyond + gradients**2 @ self.own)
 
-    def chance_of_none(self, values: Array, which: slice) -> float:
-        """Return the p-value that the parameters ``which`` of ``values`` (parameters,) are all zero (Wald's test).
+    def chance_of_none(self, k: int, weights: int) -> float:
+        """Return the p-value that all ``weights`` of effect ``k``, which has only weights, are zero (Wald's test).
 
-        The estimate with the largest p-value counts. Parameters that cancel each other are jointly certain although
-        each is uncertain.
+        Parameters that cancel each other are jointly certain although each is uncertain.
         """
-        v = values[which]
-        accounts = (
-            self.moved[:, which].T @ self.moved[:, which],
-            self.plain[which, which],
-            self.coloured[which, which],
-        )
-        least = np.inf
-        for c in accounts:
-            size = np.sqrt(np.maximum(np.diag(c), 1e-300))
-            scaled = v / size
-            least = min(least, float(scaled @ np.linalg.pinv(c / np.outer(size, size), hermitian=True) @ scaled))
-        return float(chi2.sf(least / self.beyond, max(v.size, 1)))
+        return float(chi2.sf(1.0 / (self.whole[k] * self.beyond), max(weights, 1)))
 
     def deviations(self) -> Array:
         """Return the standard deviation of each parameter (parameters,)."""
@@ -136,24 +126,49 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     limit = HUBER * robust_scale(r, 1.0)
     r = np.clip(r, -limit, limit)
     size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
-    js = j / size
-    data = js.T @ js
-    # what a prior adds shrinks an estimate and does not make it more uncertain
-    bread = np.linalg.pinv(data + np.diag(_priors(fitted) / stride / size**2), rcond=1e-12)
     block = np.zeros(rows.size, int)
     for b, (start, stop) in enumerate(problem.fit_blocks):
         block[(rows >= start) & (rows < stop)] = b
     blocks = np.tile(block, len(problem.twin.outputs))
-    scores = np.zeros((len(problem.fit_blocks), j.shape[1]))
-    np.add.at(scores, blocks, js * r[:, None])
-    moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
-    plain = bread @ data @ bread * float(np.mean(r * r))
-    coloured = bread @ _coloured_meat(problem, js, r) @ bread if stride == 1 else plain
+    priors = _priors(fitted) / stride
+    accounts = partial(_accounts, problem, r=r, blocks=blocks, thinned=stride > 1)
+    moved, plain, coloured = accounts(j / size, priors=priors / size**2)
+    whole = dict[int, float]()
+    for k in range(len(fitted.model.placed)):
+        own, weights = fitted.model.slices(k)
+        if own.start == own.stop:
+            # all weights as one column: their matrix may be too nearly singular to be inverted
+            v = fitted.theta[weights]
+            others = np.delete(np.arange(size.size), np.arange(weights.start, weights.stop))
+            column = j[:, weights] @ v
+            norm = max(float(np.linalg.norm(column)), 1e-300)
+            joined = np.column_stack([j[:, others] / size[others], column / norm])
+            small = np.r_[priors[others] / size[others] ** 2, float(v @ (priors[weights] * v)) / norm**2]
+            m, p, c = accounts(joined, priors=small)
+            whole[k] = max(float(np.sum(m[:, -1] ** 2)), float(p[-1, -1]), float(c[-1, -1])) / norm**2
     idle = size < 1e-6 * np.sqrt(rows.size) / np.maximum(_ranges(fitted), 1e-300)
     scale = np.where(idle, 0.0, 1.0 / size)
     own = np.where(idle, (_ranges(fitted) / 3.92) ** 2, 0.0)
     both = np.outer(scale, scale)
-    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth))
+    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth), whole)
+
+
+def _accounts(
+    problem: Problem, js: Array, *, r: Array, blocks: NDArray[np.int64], thinned: bool, priors: Array
+) -> tuple[Array, Array, Array]:
+    """Return (moved, plain, coloured) of ``Uncertainty`` for columns ``js`` (rows, k) of unit norm.
+
+    ``r`` (rows,): residual; ``blocks`` (rows,): its blocks; ``priors`` (k,): precisions.
+    """
+    small = np.diag(priors)
+    bread = np.linalg.pinv(js.T @ js + small, rcond=1e-12)
+    scores = np.zeros((len(problem.fit_blocks), js.shape[1]))
+    np.add.at(scores, blocks, js * r[:, None])
+    moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
+    # the noise alone moves an estimate, its prior does not: bread (js'js) bread, without the square of its condition
+    plain = (bread - bread @ small @ bread) * float(np.mean(r * r))
+    coloured = plain if thinned else bread @ _coloured_meat(problem, js, r) @ bread
+    return moved, plain, coloured
 
 
 def _priors(fitted: Fit) -> Array:
