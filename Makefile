@@ -88,7 +88,8 @@ wheel: setup
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
 # coverage by branch of every room, CORES folders of tests at a time: a run that was stopped goes on where it was, and begins
-# anew once a source has changed. Kernels are left out (a tracer cannot see compiled code; their pure-Python twins are
+# anew once a source has changed. A folder with a failing test is measured again, after the others. A test has 20 minutes
+# under the tracer. Kernels are left out (a tracer cannot see compiled code; their pure-Python twins are
 # tested), and so is what runs in processes of its own. Of the slow tests only the sample SLOW runs: the examples of every
 # command's help, which reach the commands, and diagnoses of whole recordings, which reach the mismatch engine
 CORES ?= 2
@@ -100,7 +101,8 @@ out/coverage/slow/%.data: MARK = slow
 out/coverage/%.data: MARK = not slow and not realtime
 define measure
 mkdir -p $(@D) && rm -f $@.part
-COVERAGE_FILE=$@.part $(BIN)/pytest -q -m "$(MARK)" $* --cov --cov-report= --cov-fail-under=0 || [ $$? -eq 5 ]
+COVERAGE_FILE=$@.part $(BIN)/pytest -q -m "$(MARK)" $* -o timeout=1200 --cov --cov-report= --cov-fail-under=0 || \
+  [ $$? -eq 5 ]
 if [ -e $@.part ]; then mv $@.part $@; else touch $@; fi
 endef
 # two rules: one rule of two patterns would take the slow tests of a folder for done with its others
@@ -109,7 +111,7 @@ out/coverage/slow/%.data: $(SOURCES)
 out/coverage/%.data: $(SOURCES)
 	$(measure)
 coverage: setup quality
-	$(MAKE) -j $(CORES) $(MEASURED)
+	$(MAKE) -k -j $(CORES) $(MEASURED)
 	$(BIN)/coverage combine -q --keep --data-file=out/coverage/all $$(find out/coverage -name '*.data' -size +0)
 	for room in hal:90 drivers:90 firmware_py:90 sim_devices:85 tools:85; do \
 	  $(BIN)/coverage report --data-file=out/coverage/all --include="$${room%:*}/*" --fail-under=$${room#*:} \
