@@ -88,8 +88,8 @@ wheel: setup
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
 # coverage by branch of every room, CORES folders of tests at a time: a run that was stopped goes on where it was, and begins
-# anew once a source has changed. A folder with a failing test is measured again, after the others. A test has 20 minutes
-# under the tracer. Kernels are left out (a tracer cannot see compiled code; their pure-Python twins are
+# anew once a source has changed. A test that fails ends it after the other folders, and the next run measures its
+# folder again; a test has 20 minutes under the tracer. Kernels are left out (a tracer cannot see compiled code; their pure-Python twins are
 # tested), and so is what runs in processes of its own. Of the slow tests only the sample SLOW runs: the examples of every
 # command's help, which reach the commands, and diagnoses of whole recordings, which reach the mismatch engine
 CORES ?= 2
