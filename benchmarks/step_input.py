@@ -16,17 +16,18 @@ from tools.cli.bench_option import bench_path
 
 SETTLED = 3000
 """Ticks before the measured ones: aligned, settled, the adaptive filter has begun to solve."""
+_OLD_STROKES = {"centring": 0.0, "overdrive_tilts": False, "yield_attack_s": 0.0}
 
 
 @cache
 def _configs():
-    """Without relative errors and centring, which the numpy and C versions of the step do not have."""
+    """Without what the numpy and C versions lack: relative errors, centring, scales that follow a swing."""
     configs = load_plan(load_bench(bench_path(None))).stages
     adaptive = configs.tremor.adaptive.model_copy(update={"relative": 0.0})
     return replace(
         configs,
         tremor=configs.tremor.model_copy(update={"adaptive": adaptive}),
-        actuation=configs.actuation.model_copy(update={"centring": 0.0, "overdrive_tilts": False}),
+        actuation=configs.actuation.model_copy(update={**_OLD_STROKES, "overdrive_tilt": configs.actuation.overdrive}),
     )
 
 

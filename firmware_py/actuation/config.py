@@ -95,11 +95,16 @@ class ActuationConfig(BaseModel):
     yield_s: Positive = 2.0
     """Time for which the peaks that make slow motion yield to tremor are remembered
     (firmware_py/actuation/yielding.py)."""
-    overdrive: Annotated[float, Field(ge=0.0, le=100.0)] = 1.4
-    """Most that tremor beyond the stroke may swing, in strokes: a clipped swing still cancels more than one that just
-    fits, and shakes the tip above the band with its corners. 0: every swing is clipped."""
+    yield_attack_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
+    """Time constant with which the scales follow a swing that grows; until then the strokes clip it. 0: at once, and
+    the rest by its position alone, whose corners shake the tip above the band."""
+    overdrive: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
+    """Most that tremor beyond the stroke may swing along the shaft, in strokes: a clipped swing still cancels more than
+    one that just fits, and shakes the tip above the band with its corners. 0: every swing is clipped."""
     overdrive_tilts: bool = True
     """False: only the swing along the shaft is limited so; a tilt beyond the stroke is clipped."""
+    overdrive_tilt: Annotated[float, Field(ge=0.0, le=100.0)] = 1.4
+    """The same of a tilt, which is beyond the stroke in short swings alone."""
     centring: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Share of the way from neutral to the middle of what the strokes reach; compensation works about that point.
     Stacks shrink less from neutral than they grow, so at 0 the shorter side is all that a swing may use."""

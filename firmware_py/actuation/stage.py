@@ -58,6 +58,8 @@ class ActuateParams:
     yield_keep: float = field("1")
     overdrive: float = field("1")
     tilts: int = field("1")
+    overdrive_tilt: float = field("1")
+    yield_attack: float = field("1")
     centre: float = field("m")  # of every stroke, where compensation works about
     mounting: Array = field("1", 3, 3)
     geometry: Geometry = field("")
@@ -118,6 +120,8 @@ def actuate_params(config: ActuationConfig) -> Records[ActuateParams]:
         yield_keep=exp(-1.0 / (config.yield_s * config.tick_hz)),
         overdrive=config.overdrive,
         tilts=config.overdrive_tilts,
+        overdrive_tilt=config.overdrive_tilt,
+        yield_attack=1.0 - exp(-1.0 / (config.yield_attack_s * config.tick_hz)) if config.yield_attack_s > 0.0 else 1.0,
         mounting=config.mounting,
         geometry=geometry_of(config),
         low_V=config.low_V,
@@ -212,7 +216,10 @@ def actuate_kernel(frame: Array, states: Records[ActuateState], params: Records[
     strokes_from_tip(tip, param.geometry, state.tilt, stroke)
     strokes_from_tip(core_tip, param.geometry, state.yielding.tilt, core_stroke)
     low, high = param.swing_low, param.swing_high
-    swing, limits = Swing(stroke, core_stroke), YieldLimits(low, high, param.yield_keep, param.overdrive, param.tilts)
+    swing = Swing(stroke, core_stroke)
+    limits = YieldLimits(
+        low, high, param.yield_keep, param.overdrive, param.tilts, param.overdrive_tilt, param.yield_attack
+    )
     shrunk = shrink_core(swing, state.yielding, limits)
     if yield_rest(swing, state.yielding, limits) or shrunk:
         clip |= CLIP_YIELD

@@ -62,6 +62,8 @@ class AdaptiveParams:
     outlier: float = field("1")
     ease: float = field("1")  # share of the way to the solved filter in one tick
     relative: float = field("1")
+    relative_power: float = field("1")
+    quiet_power: float = field("1")
     core_weight: Array = field("1", 5)
     core_tremor: Array = field("sample^2/m^2", LEVELS, "m", "m")
     core_rest: Array = field("sample^2", AXES, "m", "m")
@@ -169,6 +171,8 @@ def adaptive_params(config: TremorConfig) -> Records[AdaptiveParams]:
         outlier=a.outlier,
         ease=1.0 - exp(-1.0 / (a.ease_s * config.tick_hz)) if a.ease_s > 0.0 else 1.0,
         relative=a.relative,
+        relative_power=a.relative_powers[0],
+        quiet_power=a.relative_powers[1],
         **{f"core_{name}": value for name, value in vars(d.core).items()},
     )
 
@@ -502,7 +506,8 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
             whole += _mean_power(state, other, level, params)
             core += _mean_core_power(state, other, level, params)
         wider = whole / core
-        rows *= sqrt(wider)  # the penalty counts between one in metres and one relative to the tremor
+        by = params.quiet_power
+        rows *= sqrt(wider) if by == 0.5 else wider**by  # 0.5: to the last bit as in recordings of then
     for i in range(m):
         for j in range(i + 1):
             a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[axis, i, j])
@@ -518,7 +523,7 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
             )  # fmt: skip
             _take(part, share, 1e300 if other == axis else power, state)
     if params.relative > 0.0:
-        counts = params.relative * wider
+        counts = params.relative * wider**params.relative_power
         power = _mean_core_power(state, axis, level, params)
         for i in range(m):
             for j in range(i + 1):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import isfinite, pi
+from math import cos, isfinite, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -341,6 +341,20 @@ def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
     return b, denominator
 
 
+def _shelf(hz: float, gain: float, tick_hz: float) -> tuple[Array, Array]:
+    """Return numerator and denominator of a filter that is 1 far below ``hz`` and ``gain`` far above it.
+
+    (1 + s q / g + s^2) g / (1 + s q g + s^2) of s = tan(w / 2) scaled by the root of ``gain``: a bilinear transform.
+    """
+    w = 2.0 * pi * hz / tick_hz
+    root, c = sqrt(gain), cos(w)
+    slope = sqrt(2.0 * root) * sin(w)
+    high, low = root + 1.0 + (root - 1.0) * c, root + 1.0 - (root - 1.0) * c
+    across = root - 1.0 + (root + 1.0) * c, root - 1.0 - (root + 1.0) * c
+    numerator = root * np.array([high + slope, -2.0 * across[0], high - slope])
+    return numerator / (low + slope), np.array([low + slope, 2.0 * across[1], low - slope]) / (low + slope)
+
+
 @lru_cache(maxsize=8)
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     """Return everything that follows from ``config``: the axes' designs, stacked. A run asks for it several times, so
@@ -355,6 +369,8 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     back = _complex(1.0 / z)
     b, denominator = _peak(a.emphasis_hz, a.emphasis_q, config.tick_hz)
     numerator = denominator + (a.emphasis - 1.0) * b
+    if a.above > 1.0:
+        numerator, denominator = _shelf(a.above_hz, a.above, config.tick_hz)
     weight = _polynomial(numerator, back) / _polynomial(denominator, back)
     gate_b, gate_a = _peak(a.gate_hz, a.gate_q, config.tick_hz)
     through_gate = _polynomial(gate_b, back) / _polynomial(gate_a, back)

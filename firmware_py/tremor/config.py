@@ -117,7 +117,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "cancel_from_hz": (3.0, 6.0),
                 "cancel_to_hz": (13.0, 16.0),
                 "emphasis": 1.0,
-                "relative": 12.0,
+                "relative": 10.0,
+                "relative_powers": (1.15, 1.3),
+                "above": 8.0,
                 "core_q": 4.0,
                 "prior_s": 0.2,
                 "burst_prior_s": 0.5,
@@ -147,8 +149,10 @@ class AdaptiveConfig(_Table):
     approaches the one that was solved last. ``relative``: the error is counted twice, relative to the hand's motion in
     all that is cancelled and, ``relative`` times, in the tremor band (a peak at ``emphasis_hz`` with ``core_q``); so a
     hand whose slow motion is larger does not get less of its tremor cancelled. The penalty above the band is then
-    relative to the tremor, too.
-    0: the error is counted in metres.
+    relative to the tremor, too. ``relative_powers``: with which powers of all motion over the tremor the tremor's error
+    and the penalty count; 1 is relative, more is stricter where a hand's other motion is large.
+    0: the error is counted in metres. ``above``: an error above ``above_hz`` counts so many times an error below it, so
+    that the filter does not enlarge motion of the hand that it is not to cancel.
     """
 
     preset: str = ""
@@ -162,6 +166,9 @@ class AdaptiveConfig(_Table):
     emphasis_hz: Positive = 9.8
     emphasis_q: Positive = 1.5
     relative: NotNegative = 0.0
+    relative_powers: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    above: Annotated[float, Field(ge=1.0, le=100.0)] = 1.0
+    above_hz: Positive = 18.0
     core_q: Positive = 2.5
     block_s: Positive = 0.01
     half_width_s: Positive = 0.5
@@ -219,6 +226,8 @@ class AdaptiveConfig(_Table):
         (a, b), (c, d) = self.cancel_from_hz, self.cancel_to_hz
         if not a < b < c < d:
             raise ValueError("adaptive: cancel_from_hz and cancel_to_hz must rise: from low to high")
+        if self.above > 1.0 and self.emphasis > 1.0:
+            raise ValueError("adaptive: above and emphasis both shape the one filter of errors; set one of them to 1")
         if any(low >= high for low, high in pairwise(self.core_hz)):
             raise ValueError("adaptive: core_hz must rise: from low to high")
         if self.shaken_hz and self.shaken_hz[0] > self.shaken_hz[1]:
@@ -302,8 +311,9 @@ class TremorConfig(_Table):
             raise ValueError("wflc: low_hz < start_hz < high_hz < tick_hz / 2 is needed")
         if not self.bmflc.low_hz < self.bmflc.high_hz < 0.5 * self.tick_hz:
             raise ValueError("bmflc: low_hz < high_hz < tick_hz / 2 is needed")
-        if not max(self.adaptive.cancel_to_hz[1], self.adaptive.core_hz[-1]) < 0.5 * self.tick_hz:
-            raise ValueError("adaptive: cancel_to_hz and core_hz must end below tick_hz / 2")
+        a = self.adaptive
+        if not max(a.cancel_to_hz[1], a.core_hz[-1], a.above_hz) < 0.5 * self.tick_hz:
+            raise ValueError("adaptive: cancel_to_hz, core_hz and above_hz must end below tick_hz / 2")
         if self.ar.order * self.ar.spacing_s > 0.25:
             raise ValueError("ar: order times spacing_s must be below 0.25 s")
         if self.isolated and self.sees != "displacement":

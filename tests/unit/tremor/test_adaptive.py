@@ -235,10 +235,12 @@ def _system(state: Any, param: Any, level: int, part: str) -> tuple[np.ndarray, 
     return np.tril(below) + np.tril(below, -1).T + n0 * prior, right, power
 
 
-def test_relative_errors_add_up_over_the_whole_band_and_the_tremor() -> None:
+@pytest.mark.parametrize("powers", [(1.0, 0.5), (1.15, 1.3)])
+def test_relative_errors_add_up_over_the_whole_band_and_the_tremor(powers: tuple[float, float]) -> None:
     """The learned filter solves the sum of two systems, each over its own motion's power, with the prior in both."""
     relative = 12.0
-    config = TremorConfig(adaptive=AdaptiveConfig(share=0.0, emphasis=1.0, relative=relative))
+    adaptive = AdaptiveConfig(share=0.0, emphasis=1.0, relative=relative, relative_powers=powers)
+    config = TremorConfig(adaptive=adaptive)
     record = make_record(3, "one tone", 6.0)
     estimator = Estimator(config)
     estimator.run(np.repeat(record.acceleration[:, None], 3, axis=1))
@@ -247,8 +249,9 @@ def test_relative_errors_add_up_over_the_whole_band_and_the_tremor() -> None:
         whole, right, all_power = _system(state, param, level, "")
         core, core_right, tremor_power = _system(state, param, level, "core_")
         rows, wider = state.count[0, level] + param.prior_blocks[level], all_power / tremor_power
-        matrix = whole + relative * wider * core + np.sqrt(wider) * rows * param.quiet[0]
-        right = right + relative * wider * core_right
+        counts = relative * wider ** powers[0]
+        matrix = whole + counts * core + rows * wider ** powers[1] * param.quiet[0]
+        right = right + counts * core_right
         found = np.array(state.solved[0, level])
         np.testing.assert_allclose(found @ matrix, right, rtol=0.05, atol=0.02 * np.abs(right).max())
 
@@ -315,6 +318,32 @@ def test_what_is_learned_is_penalized_as_the_prior_is() -> None:
         ahead = Estimator(config, axes=1).run(record.acceleration[:, None]).ahead_m[:, 0]
         rough[quiet] = float(np.std(np.diff(ahead[-10_000:], 2)))
     assert rough[100.0] < 0.3 * rough[0.0]
+
+
+@pytest.mark.parametrize("rate_hz", [500.0, 1000.0, 2000.0])
+def test_errors_above_the_band_count_more(rate_hz: float) -> None:
+    config = TremorConfig(tick_hz=rate_hz, adaptive=AdaptiveConfig(emphasis=1.0, above=10.0))
+    b0, b1, b2, a1, a2 = design_adaptive(config).weight
+    hz = np.array([3.0, 18.0, 120.0])
+    back = np.exp(-2j * np.pi * hz / rate_hz)
+    gain = np.abs((b0 + b1 * back + b2 * back**2) / (1.0 + a1 * back + a2 * back**2))
+    np.testing.assert_allclose(gain, [1.0, np.sqrt(10.0), 10.0], rtol=0.03)
+    with pytest.raises(ValidationError, match="set one of them to 1"):
+        AdaptiveConfig(emphasis=2.0, above=10.0)
+
+
+def test_motion_above_the_band_is_not_enlarged() -> None:
+    """Of motion at 18 to 24 Hz the filter that has learned a hand passes less than half as much."""
+    record, hz = make_record(3, "two tones", 8.0), np.arange(18.0, 24.0, 0.5)
+    passed: dict[float, float] = {}
+    for above in (1.0, 10.0):
+        config = TremorConfig(adaptive=AdaptiveConfig(emphasis=1.0, relative=10.0, core_q=4.0, above=above))
+        estimator = Estimator(config)
+        estimator.run(np.repeat(record.acceleration[:, None], 3, axis=1))
+        ahead = np.array(peek(estimator.state).adaptive.solved[0, 1, 1])
+        features = design_adaptive(config).bank.response(np.exp(2j * np.pi * hz / config.tick_hz))
+        passed[above] = float(np.mean(np.abs(ahead @ features * sensor_response(config, hz)) ** 2))
+    assert passed[10.0] < 0.25 * passed[1.0], passed
 
 
 def test_a_preset_is_the_start_and_the_keys_beside_it_override_it() -> None:
