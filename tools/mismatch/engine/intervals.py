@@ -141,7 +141,7 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
             v = fitted.theta[weights]
             others = np.delete(np.arange(size.size), np.arange(weights.start, weights.stop))
             column = j[:, weights] @ v
-            norm = max(float(np.linalg.norm(column)), 1e-300)
+            norm = max(float(np.linalg.norm(column)), 1e-150)
             joined = np.column_stack([j[:, others] / size[others], column / norm])
             small = np.r_[priors[others] / size[others] ** 2, float(v @ (priors[weights] * v)) / norm**2]
             m, p, c = accounts(joined, priors=small)
