@@ -18,8 +18,10 @@ from sim_devices.physics.effect import STAGES, Array, Context, Human, Settings
 from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
-from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
+from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
+from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
 START_PASSES = 2
@@ -239,12 +241,21 @@ class Model:
 
         ``only`` restricts the outputs; ``samples`` of the recording replace the whole view.
         """
-        flow = self._flow(view_run(self.twin, view), Pass(theta, False), only=only)
+        run = view_run(self.twin, view)
+        if samples is not None and isinstance(self.twin, DynamicTwin) and all(p.site != "output" for p in self.placed):
+            # no effect needs the course of an output
+            run = replace(run, wanted=samples)
+        flow = self._flow(run, Pass(theta, False), only=only)
         keep = set(self.linear)
         constant: dict[str, Array] = {}
         columns: dict[str, Array] = {}
         linear: dict[str, tuple[int, ...]] = {}
-        take = view.take if samples is None else lambda x: x[samples]
+
+        def take(x: Array) -> Array:
+            if samples is None:
+                return view.take(x)
+            return x if x.size == samples.size else x[samples]
+
         for o, s in flow.items():
             value = take(s.value)
             js = sorted(j for j in s.columns if j in keep)

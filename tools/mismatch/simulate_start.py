@@ -15,9 +15,10 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
 from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_view import View, view_run
-from tools.mismatch.twins.base import Signal, remember, travelled
+from tools.mismatch.twins.base import Signal, travelled
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.feedback import FASTEST
+from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode import inside_of
 
 

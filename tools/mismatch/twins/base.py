@@ -64,7 +64,8 @@ class Run:
     sorted sample numbers that may set the states of a linear run instead (None: those of the window). ``period``:
     samples after which all inputs and outputs repeat from every start on (0: they do not); it then sets the start
     states. ``afresh``: samples at which the memory of effects restarts. ``bent``: True if a nonlinear effect stands
-    between the states and the measured outputs, which are then no linear function of a start state.
+    between the states and the measured outputs, which are then no linear function of a start state. ``wanted``: sorted
+    sample numbers of which alone a response may consist (None: it consists of all).
     """
 
     t: Array
@@ -79,6 +80,7 @@ class Run:
     period: int = 0
     afresh: tuple[int, ...] = (0,)
     bent: bool = False
+    wanted: NDArray[np.int64] | None = None
 
     @property
     def start_window(self) -> int:
@@ -213,24 +215,3 @@ def fold(signal: Signal, theta: Array, gain: float = 1.0) -> Signal:
         value += theta[j] / gain * c
     key = tuple((j, float(theta[j] / gain)) for j in signal.columns)
     return Signal(value, {}, (*signal.token, key))
-
-
-MEMO_BYTES = 1 << 28  # largest cache of unchanged columns of a view
-
-
-def remember(memo: dict[object, object], key: object, make: Callable[[], Array]) -> Array:
-    """Return the result of ``make()``, computed once per key; the cache is cleared when it is full."""
-    found = memo.get(key)
-    if isinstance(found, np.ndarray):
-        return found
-    value = make()
-    size = memo.get("bytes", 0)
-    assert isinstance(size, int)
-    if value.nbytes > MEMO_BYTES // 2:
-        return value
-    if size + value.nbytes > MEMO_BYTES:
-        memo.clear()
-        size = 0
-    memo[key] = value
-    memo["bytes"] = size + value.nbytes
-    return value

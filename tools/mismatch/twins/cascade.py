@@ -16,10 +16,11 @@ import numpy as np
 from sim_devices.physics.effect import Array, Human
 from tools.errors import RecordingError
 from tools.mismatch.recording import Recording, TwinText
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, discretise_blocks
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import Hold, between_samples, run_states
+from tools.mismatch.twins.memo import remember
 
 BETWEEN = "between"
 """Signal between the two filters: the target of effects there."""

@@ -12,8 +12,9 @@ from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.errors import RecordingError
 from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
+from tools.mismatch.twins.memo import remember
 
 _NEXT = ((1, 2), (2, 0), (0, 1))
 

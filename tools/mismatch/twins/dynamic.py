@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import UNCENTRED
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, remember, travelled
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, travelled
 from tools.mismatch.twins.feedback import Body, Rows, pack, run_feedback
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import (
@@ -24,6 +24,7 @@ from tools.mismatch.twins.linear import (
     run_states,
     start_state,
 )
+from tools.mismatch.twins.memo import remember
 
 CONSTANT = ""  # the input "1"
 MOST_SUBSTEPS = 24
@@ -253,6 +254,9 @@ class DynamicTwin(Head):
                     if run.period
                     else ss.states({o: run.measured[o] - group_values[o] for o in group_values})
                 )
+                if run.wanted is not None:
+                    self._settle_at(run, ss, x0, value, columns)
+                    continue
                 for o in group:
                     value[o] = ss.added(value[o].copy(), x0, o)
                 for entry in columns.values():
@@ -264,6 +268,27 @@ class DynamicTwin(Head):
                         # a copy, because the column may be cached
                         entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
         return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}, (*token, o)) for o in self.outputs}
+
+    def _settle_at(
+        self, run: Run, ss: StartState, x0: Array, value: dict[str, Array], columns: dict[int, dict[str, Array]]
+    ) -> None:
+        """Settle a value and all columns of a group of outputs at once, at the wanted samples of a run only."""
+        wanted, period = run.wanted, run.period
+        assert wanted is not None
+        entries = [e for e in columns.values() if any(o in e for o in ss.outputs)]
+        zero = np.zeros(run.t.size)
+        given = {o: [e.get(o, zero) for e in entries] for o in ss.outputs}
+        if period:
+            alone = [{o: given[o][i] for o in ss.outputs} for i in range(len(entries))]
+            states = np.stack([x0, *(ss.steady(y, period) for y in alone)], axis=2)
+        else:
+            states = np.concatenate([x0[:, :, None], -ss.states_of(given)], axis=2) if entries else x0[:, :, None]
+        for o in ss.outputs:
+            free = [f @ x for f, x in zip(ss.at(wanted, o), states, strict=True)]
+            found = np.stack([value[o][wanted], *(c[wanted] for c in given[o])], axis=1) + np.concatenate(free)
+            value[o] = found[:, 0]
+            for i, entry in enumerate(entries):
+                entry[o] = found[:, i + 1]
 
     def _start_state(
         self, run: Run, ad: Array, blocks: tuple[tuple[int, int], ...], group: Mapping[str, int | tuple[int, ...]]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.exponential import exponential
+from tools.mismatch.twins.memo import remember, stored
 
 if TYPE_CHECKING:
     from tools.mismatch.twins.base import Run
@@ -209,26 +210,48 @@ def free_response(ad: Array, c: Array, length: int) -> Array:
     return out
 
 
-def free_by_blocks(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
-    """Return ``free_response`` of a block-diagonal ``ad``: each block (first row, last row + 1) runs by itself."""
-    if len(blocks) < 2:
-        return free_response(ad, c, length)
-    parts = (free_response(np.ascontiguousarray(ad[a:b, a:b]), np.ascontiguousarray(c[a:b]), length) for a, b in blocks)
-    return np.concatenate(list(parts), axis=1)
+@kernel
+def add_free(y, free, x0):
+    """Add ``free @ x0`` (m,) to the first samples of ``y`` (n,) in place; free (m, s), x0 (s,)."""
+    m, s = free.shape
+    if s == 2:
+        p = x0[0]
+        q = x0[1]
+        for k in range(m):
+            y[k] += free[k, 0] * p + free[k, 1] * q
+        return
+    for k in range(m):
+        v = 0.0
+        for i in range(s):
+            v += free[k, i] * x0[i]
+        y[k] += v
 
 
-def felt_at_most(ad: Array, longest: int) -> int:
+Blocks = tuple[tuple[int, int], ...]
+
+
+def blocks_of(ad: Array, blocks: Blocks) -> Blocks:
+    """Return the blocks of ``ad``, first row and last row + 1 of each; a single one if none are named."""
+    return blocks or ((0, ad.shape[0]),)
+
+
+def poles_of(ad: Array, blocks: Blocks) -> NDArray[np.complex128]:
+    """Return the eigenvalues of a block-diagonal ``ad``."""
+    return np.concatenate([np.linalg.eigvals(ad[a:b, a:b]) for a, b in blocks_of(ad, blocks)]).astype(np.complex128)
+
+
+def felt_at_most(ad: Array, longest: int, blocks: Blocks = ()) -> int:
     """Return a bound on the samples after which a free response is below 1e-12 of its largest, at most ``longest``."""
-    slowest = float(np.max(np.abs(np.linalg.eigvals(ad)), initial=0.0))
+    slowest = float(np.max(np.abs(poles_of(ad, blocks)), initial=0.0))
     if slowest >= 1.0:
         return longest
     # repeated poles grow by powers of time before they decay
     return min(longest, 50 * (ad.shape[0] + 1) + int(42.0 * ad.shape[0] / -np.log(max(slowest, 1e-12))))
 
 
-def forgets(ad: Array, samples: int) -> bool:
+def forgets(ad: Array, samples: int, blocks: Blocks = ()) -> bool:
     """Return True if no mode integrates or grows within so many samples: each decays, or swings without growth."""
-    poles = np.linalg.eigvals(ad)
+    poles = poles_of(ad, blocks)
     size = np.abs(poles)
     swings = (size <= 1.0 + 1e-12) & (np.abs(np.angle(poles)) * samples > 1.0)
     return bool(np.all((size**samples < FORGOTTEN) | swings))
@@ -238,29 +261,67 @@ FORGOTTEN = 0.6
 """Ratio of a free response at the end of a stretch to that at its start, below which it is not an integrator's."""
 
 
-def _while_felt(free: Array, window: int) -> Array:
-    """Return free responses until they are below 1e-12 of their largest, at least over ``window``."""
-    size = np.abs(free).max(axis=1, initial=0.0)
-    felt = np.flatnonzero(size > 1e-12 * size.max(initial=0.0))
-    return free[: max(window, int(felt[-1]) + 1 if felt.size else 0)]
+@kernel
+def felt_samples(free):
+    """Return the number of samples after which a free response (m, s) is below 1e-12 of its largest."""
+    m, s = free.shape
+    most = 0.0
+    for k in range(m):
+        for i in range(s):
+            most = max(most, abs(free[k, i]))
+    for k in range(m - 1, -1, -1):
+        for i in range(s):
+            if abs(free[k, i]) > 1e-12 * most:
+                return k + 1
+    return 0
 
 
 @dataclass(frozen=True)
 class StartState:
     """Sets the state at each start by least squares over some measured samples, for every column alike.
 
-    ``free[o]`` (while felt, s); ``samples`` of each start that may set its state, and ``solvers`` (s, outputs *
-    samples): the least-squares inverse of the stacked, weighted free responses there.
+    ``free[o]`` (while felt, s) of each block; ``samples`` of each start that may set its state, and ``solvers``
+    (s, outputs * samples): the least-squares inverse of the stacked, weighted free responses there. ``shared`` is the
+    cache of the view.
     """
 
     outputs: tuple[str, ...]
-    free: dict[str, Array]
+    blocks: Blocks
+    free: dict[str, tuple[Array, ...]]
     weight: dict[str, float]
     spans: tuple[tuple[int, int], ...]
     samples: tuple[NDArray[np.int64], ...]
     solvers: tuple[Array, ...]
     ad: Array
+    shared: dict[object, object] = field(compare=False, repr=False)
     memo: dict[object, Array] = field(default_factory=dict[object, Array], compare=False, repr=False)
+
+    def inverses(self, rows: Mapping[str, Array], rough: float, window: int) -> tuple[Array, ...]:
+        """Return the inverse (s, outputs * samples) of the free responses at each start; equal ones are one array.
+
+        ``rows[o]`` (s,) shows output o; ``rough``: see ``held_inverse``; ``window``: samples that an integrator counts.
+        """
+        stretch = max(b - a for a, b in self.spans)
+        settles = forgets(self.ad, stretch, self.blocks)
+        horizon = min(stretch, felt_at_most(self.ad, stretch, self.blocks)) if settles else window
+
+        def shape_of(c: Array, a: int, b: int) -> Array:
+            block, row = np.ascontiguousarray(self.ad[a:b, a:b]), np.ascontiguousarray(c[a:b])
+            key = ("shape", block.tobytes(), row.tobytes(), horizon)
+            return remember(self.shared, key, lambda: response_shape(block, row, horizon))
+
+        shapes = {o: np.concatenate([shape_of(c, a, b) for a, b in self.blocks], axis=1) for o, c in rows.items()}
+        shape = np.concatenate([x * self.weight[o] for o, x in shapes.items()])
+        known: dict[bytes, Array] = {}
+        solvers: list[Array] = []
+        for (a, _), samples in zip(self.spans, self.samples, strict=True):
+            since = samples - a
+            name = since.tobytes()
+            if name not in known:
+                seen = [_padded(self.free[o], since, self.shared) * self.weight[o] for o in rows]
+                known[name] = held_inverse(np.concatenate(seen), shape, rough)
+            solvers.append(known[name])
+        return tuple(solvers)
 
     def states(self, need: dict[str, Array]) -> Array:
         """Return start states (starts, s) whose free response fits ``need`` (n,) per output at the samples."""
@@ -270,6 +331,14 @@ class StartState:
             rows.append(solver @ stacked)
         return np.stack(rows)
 
+    def states_of(self, need: Mapping[str, Sequence[Array]]) -> Array:
+        """Return the states (starts, s, columns) of ``states`` for every column of ``need``."""
+        found: list[Array] = []
+        for at, solver in zip(self.samples, self.solvers, strict=True):
+            stacked = [np.stack([c[at] for c in need[o]]) * self.weight[o] for o in self.outputs]
+            found.append(solver @ np.concatenate(stacked, axis=1).T)
+        return np.stack(found)
+
     def steady(self, y: Mapping[str, Array], period: int) -> Array:
         """Return start states (starts, s) that make responses ``y`` (n,) to periodic inputs periodic.
 
@@ -278,9 +347,11 @@ class StartState:
         """
         key = ("steady", period)
         if key not in self.memo:
-            length = min(max(f.shape[0] for f in self.free.values()), MOST_SETTING)
+            length = min(max(f.shape[0] for parts in self.free.values() for f in parts), MOST_SETTING)
             least = min(length, *(b - a - period for a, b in self.spans))
-            seen = np.concatenate([_padded(self.free[o], np.arange(least)) * self.weight[o] for o in self.outputs])
+            seen = np.concatenate(
+                [_padded(self.free[o], np.arange(least), self.shared) * self.weight[o] for o in self.outputs]
+            )
             inverse = held_inverse(seen, seen, ROUGH_OF_A_PERIOD)
             full = np.linalg.matrix_power(self.ad, period)
             solved = np.linalg.lstsq(np.eye(full.shape[0]) - full, inverse, rcond=1e-14)[0]
@@ -302,20 +373,29 @@ class StartState:
 
     def added(self, y: Array, states: Array, output: str) -> Array:
         """Add the free response of an output to ``y`` (n,) in place while it is not negligible; return ``y``."""
-        free = self.free[output]
         for (a, b), x0 in zip(self.spans, states, strict=True):
-            m = min(b - a, free.shape[0])
-            y[a : a + m] += free[:m] @ x0
+            for (i, j), free in zip(self.blocks, self.free[output], strict=True):
+                add_free(y[a:b], free[: b - a], x0[i:j])
         return y
+
+    def at(self, wanted: NDArray[np.int64], output: str) -> tuple[Array, ...]:
+        """Return the responses (samples, s) of an output to the unit start states of each stretch, at its ``wanted``
+        samples.
+
+        ``wanted``: sorted sample numbers, all behind the first start.
+        """
+        edges = np.searchsorted(wanted, [a for a, _ in self.spans] + [self.spans[-1][1]])
+        return tuple(
+            _padded(self.free[output], wanted[i:j] - a, self.shared)
+            for (a, _), i, j in zip(self.spans, edges[:-1], edges[1:], strict=True)
+        )
 
 
 MOST_SETTING = 4000
 """Largest number of samples that set a start state; of more, as many at irregular distances are selected."""
 
 
-def start_state(
-    ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = True, blocks: tuple[tuple[int, int], ...] = ()
-) -> StartState:
+def start_state(ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = True, blocks: Blocks = ()) -> StartState:
     """Prepare the least squares for output rows c (s,) of the outputs that may set the state.
 
     The first samples after each start (``run.start_window``) set its state; with ``run.setting`` those of them that lie
@@ -329,35 +409,49 @@ def start_state(
     if isinstance(found, StartState):
         return found
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
-    longest = max(b - a for a, b in spans) if whole else window
-    longest = max(window, felt_at_most(ad, longest))
-    free = {o: _while_felt(free_by_blocks(ad, c, longest, blocks), window) for o, c in rows.items()}
-    felt = max(f.shape[0] for f in free.values())
-    at = tuple(_setting(a, min(b, a + felt), window, setting) for a, b in spans)
+    stretch = max(b - a for a, b in spans)
+    parts = blocks_of(ad, blocks)
+    free = {
+        o: tuple(_free(ad, c, part, stretch if whole else window, window, memo) for part in parts)
+        for o, c in rows.items()
+    }
+    felt = max(f.shape[0] for responses in free.values() for f in responses)
+    read = ("setting", starts, n, felt, *how)
+    at = memo.get(read)
+    if not isinstance(at, tuple):
+        at = memo[read] = tuple(_setting(a, min(b, a + felt), window, setting) for a, b in spans)
     weight = dict.fromkeys(rows, 1.0)
     if len(rows) > 1:
         # outputs of different units weigh alike over the samples that may set the state
         seen = np.concatenate(at)
         weight = {o: 1.0 / (float(np.std(run.measured[o][seen])) or 1.0) for o in rows}
-    known: dict[bytes, Array] = {}
-    solvers: list[Array] = []
-    stretch = max(b - a for a, b in spans)
-    horizon = min(stretch, felt_at_most(ad, stretch)) if forgets(ad, stretch) else window
-    shape = np.concatenate([response_shape(ad, c, horizon, blocks) * weight[o] for o, c in rows.items()])
     rough = max(
         LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW,
         *(_roughness(run.measured[o], memo, o) for o in rows),
     )
-    for (a, _), samples in zip(spans, at, strict=True):
-        since = samples - a
-        name = since.tobytes()
-        if name not in known:
-            stacked = np.concatenate([_padded(free[o], since) * weight[o] for o in rows])
-            known[name] = held_inverse(stacked, shape, rough)
-        solvers.append(known[name])
-    made = StartState(tuple(rows), free, weight, spans, at, tuple(solvers), ad)
+    # outputs that show the states alike share the inverse
+    same = ("solvers", ad.tobytes(), tuple((c.tobytes(), weight[o]) for o, c in rows.items()), rough, *key[3:])
+    solvers = memo.get(same)
+    made = StartState(tuple(rows), parts, free, weight, spans, at, (), ad, memo)
+    if not isinstance(solvers, tuple):
+        solvers = made.inverses(rows, rough, window)
+        stored(memo, same, solvers, sum({id(x): x.nbytes for x in solvers}.values()))
+    made = replace(made, solvers=solvers)
     memo[key] = made
     return made
+
+
+def _free(ad: Array, c: Array, part: tuple[int, int], longest: int, window: int, memo: dict[object, object]) -> Array:
+    """Return the free response of one block while it is felt, at least over ``window``; cached."""
+    a, b = part
+    block, row = np.ascontiguousarray(ad[a:b, a:b]), np.ascontiguousarray(c[a:b])
+
+    def make() -> Array:
+        length = max(window, felt_at_most(block, longest))
+        free = free_response(block, row, length)
+        return free[: max(window, felt_samples(free))]
+
+    return remember(memo, ("free", block.tobytes(), row.tobytes(), longest, window), make)
 
 
 LEAST_ROUGH = 0.01
@@ -391,15 +485,15 @@ def held_inverse(seen: Array, whole: Array, rough: float) -> Array:
     return np.ascontiguousarray((to_state @ right.T * gain) @ left.T)
 
 
-def response_shape(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
+def response_shape(ad: Array, c: Array, length: int) -> Array:
     """Return ``free_response`` (m, s) at all first samples, then at every second, fourth and so on up to ``length``."""
-    parts = [free_by_blocks(ad, c, min(length, 2 * OCTAVE), blocks)]
+    parts = [free_response(ad, c, min(length, 2 * OCTAVE))]
     stride = 1
     while 2 * OCTAVE * stride < length:
         stride *= 2
         ad = ad @ ad
         count = min(2 * OCTAVE, -(-length // stride))
-        parts.append(free_by_blocks(ad, c, count, blocks)[OCTAVE:])
+        parts.append(free_response(ad, c, count)[OCTAVE:])
     return np.concatenate(parts)
 
 
@@ -438,9 +532,22 @@ LEAST_SETTING = 8
 """Least number of samples that may set a state; with fewer, the first samples after the start do."""
 
 
-def _padded(free: Array, since: NDArray[np.int64]) -> Array:
-    """Return rows of a free response, zero where it has decayed."""
-    out = np.zeros((since.size, free.shape[1]))
-    felt = since < free.shape[0]
-    out[felt] = free[since[felt]]
-    return out
+def _padded(free: Sequence[Array], since: NDArray[np.int64], memo: dict[object, object]) -> Array:
+    """Return rows (sorted ``since``) of the free responses of all blocks, zero where one has decayed.
+
+    Those of each block are cached in ``memo`` as long as its response, which is identified by its place in memory.
+    """
+    which = since.tobytes()
+
+    def rows_of(f: Array) -> Array:
+        key = ("rows", id(f), which)
+        known = memo.get(key)
+        if isinstance(known, tuple):
+            return known[1]
+        felt = int(np.searchsorted(since, f.shape[0]))
+        out = np.zeros((since.size, f.shape[1]))
+        out[:felt] = f[since[:felt]]
+        stored(memo, key, (f, out), out.nbytes)
+        return out
+
+    return np.concatenate([rows_of(f) for f in free], axis=1)

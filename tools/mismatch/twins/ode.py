@@ -15,7 +15,7 @@ from sim_devices.physics.forces import FLOW, UNCENTRED
 from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.equations import (
     LEAST_SHOWN,
@@ -31,6 +31,7 @@ from tools.mismatch.twins.equations import (
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
+from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode_run import SWAY, Drive
 
 MOST_SUBSTEPS = 200

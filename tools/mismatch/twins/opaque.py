@@ -19,7 +19,8 @@ from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
 from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording, Simulate
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
+from tools.mismatch.twins.memo import remember
 
 
 class UserTwin(Protocol):
