@@ -147,12 +147,16 @@ def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, 
     return np.clip(found.x / scale, least, most)
 
 
-def _search(projected: Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
+def search(
+    projected: Projected, theta: Array, iterations: int, tolerance: float, jacobian: Array | None = None
+) -> tuple[Array, float]:
     """Search by damped Gauss-Newton steps with bounds; return theta and the cost.
 
     Between steps the sensitivities are updated by the result of the step (Broyden, Mathematics of Computation 19, 1965)
-    and computed again only when that no longer decreases the cost.
+    and computed again only when that no longer decreases the cost. Those that are given as ``jacobian`` are only
+    updated.
     """
+    given = jacobian is not None
     model = projected.model
     free = projected.free
     residual, theta = projected.evaluate(theta)
@@ -163,7 +167,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
     lower = np.array([to_search(p, p.lo) if np.isfinite(p.lo) else -np.inf for p in parameters])
     upper = np.array([to_search(p, p.hi) if np.isfinite(p.hi) else np.inf for p in parameters])
     damping = 1e-2
-    jacobian = slopes(projected, theta, residual)
+    jacobian = jacobian.copy() if jacobian is not None else slopes(projected, theta, residual)
     fresh = True
     for _ in range(iterations):
         if not np.all(np.isfinite(jacobian)):
@@ -200,7 +204,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
             damping *= 8
         if gain > tolerance:
             fresh = False
-        elif fresh:
+        elif fresh or given:
             break
         else:
             jacobian = slopes(projected, theta, residual)
@@ -209,7 +213,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
     return theta, cost
 
 
-def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
+def at_bound(model: Model, theta: Array) -> tuple[str, ...]:
     stuck: list[str] = []
     for i, p in enumerate(model.parameters):
         if i < model.n_base or not np.isfinite(p.hi - p.lo):
@@ -285,7 +289,7 @@ def fit(
         residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
     ok = (give_up or bool(np.isfinite(cost))) and bool(np.all(np.isfinite(theta))) and stayed(problem, residual)
     shrunk = {**(keep.shrunk if keep is not None else {}), **(fitted.shrunk() if fitted is not None else {})}
-    return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok, shrunk)
+    return Fit(model, theta, residual, cost, at_bound(model, theta), evaluations, ok, shrunk)
 
 
 OPENING = frozenset(
@@ -312,7 +316,7 @@ def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tupl
     ranked.sort(key=lambda r: (r[0], r[1]))
     tried: list[tuple[float, int, Array]] = []
     for _, i, theta in ranked[:tries]:
-        theta, cost = _search(projected, theta, 4, 1e-3)
+        theta, cost = search(projected, theta, 4, 1e-3)
         tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
     tried.sort(key=lambda r: (r[0], r[1]))
     size = max(1.0, projected.usual_count)
@@ -344,18 +348,18 @@ def _finely(
     if rows > 2 * SEARCH_ROWS:
         # the search begins on part of the rows and ends on all of them
         part = Projected(problem, model, outputs, SEARCH_ROWS)
-        theta, _ = _search(part, theta, iterations, tolerance)
+        theta, _ = search(part, theta, iterations, tolerance)
         before, iterations = part.evaluations, min(iterations, LAST_ITERATIONS)
     projected = Projected(problem, model, outputs, rows)
     cost = np.inf
     for round_ in range(rounds):
-        theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)
+        theta, cost = search(projected, theta, iterations if round_ == 0 else 4, tolerance)
         if not np.isfinite(cost):
             break
         if round_ + 1 < rounds:
             projected.reweight(residuals(problem, model, theta, outputs))
             projected.shrink(theta, partial(slopes, projected))
-    theta, cost = _put_away(projected, theta, cost)
+    theta, cost = put_away(projected, theta, cost)
     return theta, cost, before + projected.evaluations, projected
 
 
@@ -364,7 +368,7 @@ NOTICED = 3.84
 parameter that is not there."""
 
 
-def _put_away(projected: Projected, theta: Array, cost: float) -> tuple[Array, float]:
+def put_away(projected: Projected, theta: Array, cost: float) -> tuple[Array, float]:
     """Return (theta, cost) with every insignificant parameter at its value without influence (``Parameter.away``)."""
     for i in projected.free:
         away = projected.model.parameters[i].away

@@ -62,13 +62,33 @@ class Ground:
 
     It has ``samples`` of the recording and their ``rows`` in the view; derivatives of the outputs with respect to each
     searched parameter of the current model there (``bends[o]`` (rows, k)); and the energy of each output when
-    everything free is regressed out.
+    everything free is regressed out. For a model of many parameters (``is_wide``) it also has the derivatives with
+    respect to the linear ones that move an output: their places in ``model.linear``, and (rows, places).
     """
 
     rows: NDArray[np.int64]
     samples: NDArray[np.int64]
     bends: dict[str, Array]
     energy: dict[str, float]
+    columns: dict[str, tuple[NDArray[np.int64], Array]]
+
+    def of(self, output: str) -> tuple[NDArray[np.int64], Array]:
+        """Return the derivatives (rows, m) of an output, and which of the parameters they belong to.
+
+        The searched parameters come first, then the linear ones.
+        """
+        at, columns = self.columns[output]
+        bends = self.bends[output]
+        return np.concatenate([np.arange(bends.shape[1]), bends.shape[1] + at]), np.hstack([bends, columns])
+
+
+WIDE = 15
+"""Number of searched parameters of a fitted model above which they move linearly beside a candidate."""
+
+
+def is_wide(problem: Problem, model: Model) -> bool:
+    """Return True if the parameters of a fitted model are too many to be differentiated for every candidate."""
+    return not problem.twin.static and not problem.twin.apart and len(model.nonlinear) > WIDE
 
 
 ROWS = 12_000  # number of rows of the fit that a screen uses
@@ -98,7 +118,12 @@ def bend(problem: Problem, current: Fit) -> Ground:
             known = Regression([np.column_stack([design.columns[o], bends[o]]) / s])
             left = known.less(current.residual[o][rows] / s)
             energy[o] = float(left @ left)
-    return Ground(rows, samples, bends, energy)
+    columns: dict[str, tuple[NDArray[np.int64], Array]] = {}
+    if is_wide(problem, model):
+        design = model.design(problem.view, theta, samples=samples)
+        place = {j: c for c, j in enumerate(model.linear)}
+        columns = {o: (np.array([place[j] for j in design.linear[o]], int), design.columns[o]) for o in outputs}
+    return Ground(rows, samples, bends, energy, columns)
 
 
 def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:

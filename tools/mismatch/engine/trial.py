@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.linearised import fit_beside
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, compare, misfits
-from tools.mismatch.engine.screen import Candidate, Ground, bend, one_step
+from tools.mismatch.engine.screen import Candidate, Ground, bend, is_wide, one_step
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
@@ -92,6 +93,7 @@ def fit_one(
     stride: int,
     tops: dict[str, float],
     effort: Effort,
+    ground: Ground,
 ) -> Trial:
     """Fit a candidate jointly with the current model and compare them on held-out samples.
 
@@ -103,6 +105,9 @@ def fit_one(
     now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
     gone = max((1.0 - effort.most_left(tops[o])) * now[o] for o in touched)
     limit = (sum(now.values()) - gone) / len(now)
+    if is_wide(problem, current.model):
+        fitted = fit_beside(problem, model, current, ground, candidate.starts, hopeless=limit)
+        return Trial(candidate.placed, candidate, fitted, compare(problem, current, fitted), misfits(problem, fitted))
     thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
     fitted = fit(
         problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
@@ -189,7 +194,7 @@ def try_all(
     for c in chosen:
         for o in c.placed.outputs:
             tops[o] = max(tops[o], c.share / len(c.placed.outputs) / part[o])
-    fitted = iter(run(fit_one, chosen, (stride, tops, effort), f"{what}: fit"))
+    fitted = iter(run(fit_one, chosen, (stride, tops, effort, ground), f"{what}: fit"))
     return [next(fitted) if k else Trial(c.placed, c, None, None, {}) for c, k in zip(screened, keep, strict=True)]
 
 

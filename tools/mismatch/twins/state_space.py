@@ -17,7 +17,7 @@ from sim_devices.physics.exponential import exponential
 from tools.errors import RecordingError
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
-from tools.mismatch.twins.linear import Hold
+from tools.mismatch.twins.linear import Hold, run_states
 from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, modes_of, roots_of_mode, typical_size
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
@@ -127,15 +127,19 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         parameters.append(Parameter("y0" if len(outputs) == 1 else f"y0[{o}]", recording.unit[o], scale=typical))
         begin.append(float(m.y0[k]))
 
-    def fixed_free(n: int) -> Mapping[str, Array]:
-        y = np.zeros((n, len(outputs)))
-        if np.any(m.x0 != 0):
-            from tools.mismatch.twins.linear import free_response
+    settled: dict[int, dict[str, Array]] = {}
 
-            ad = np.ascontiguousarray(m.a if m.discrete else exponential(m.a * dt))
-            for k in range(len(outputs)):
-                y[:, k] = free_response(ad, np.ascontiguousarray(m.c[k]), n) @ m.x0
-        return {o: y[:, k] for k, o in enumerate(outputs)}
+    def fixed_free(n: int) -> Mapping[str, Array]:
+        if n not in settled:
+            settled.clear()
+            y = np.zeros((n, len(outputs)))
+            if np.any(m.x0 != 0):
+                ad = np.ascontiguousarray(m.a if m.discrete else exponential(m.a * dt))
+                still = np.zeros(ad.shape[0])
+                x = run_states(ad, still, still, np.zeros(n), m.x0[None, :], np.zeros(1, np.int64))
+                y = x @ m.c.T
+            settled[n] = {o: y[:, k] for k, o in enumerate(outputs)}
+        return settled[n]
 
     n_poles = len(parameters) - len(links)
 
