@@ -384,6 +384,15 @@ class DynamicTwin(Head):
             and (self.start_given or (run.window == 0 and not run.period))
         ):
             # with forces, the start state is no linear function of the measurement: the engineer's own is used
+            if forces and run.setting is not None and not self.at_rest:
+                # unless the twin without forces starts from a fitted one as well
+                ss = start_state(np.linalg.matrix_power(d.ad, sub), rows, run, blocks=plant.blocks)
+                x0 = np.zeros((1, plant.a.shape[0]))
+                for _ in range(2):
+                    x = go(x0, u, starts, ends)
+                    x0 = x0 + ss.states({o: run.measured[o] - extra[o] - x @ rows[o] for o in self.outputs})
+                x = go(x0, u, starts, ends)
+                return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
             free = self.fixed_free(run.t.size)
             x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}

@@ -110,6 +110,15 @@ def run_feedback(body, rows, u, x0, starts, stop):
     gv = 0.0
     for i in range(s):
         gv += cv[i] * (g0[i] + g1[i])
+    # a plant of modes is block-diagonal
+    first = np.zeros(s, np.int64)
+    last = np.zeros(s, np.int64)
+    for i in range(s):
+        for j in range(s):
+            if ad[i, j] != 0.0:
+                if last[i] == 0:
+                    first[i] = j
+                last[i] = j + 1
     any_smooth = np.any(spring != 0.0) or np.any(cogging != 0.0) or friction[4] != 0.0
     stiff = friction[5]
     bristle = 0.0
@@ -140,7 +149,7 @@ def run_feedback(body, rows, u, x0, starts, stop):
                     v += cv[i] * x[i]
                     # the motion without forces is the same in every pass
                     a = g0[i] * w0 + g1[i] * w1
-                    for j in range(s):
+                    for j in range(first[i], last[i]):
                         a += ad[i, j] * x[j]
                     free[i] = a
                 f0 = 0.0
