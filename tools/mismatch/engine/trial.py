@@ -34,11 +34,12 @@ class Effort:
     """Limits the effort on a candidate.
 
     A candidate is not refined if it gains less than ``share`` of the best one-step gain in log density, or less than
-    ``least`` (a share of the mean square of its outputs).
+    ``least`` (a share of the mean square of its outputs). ``stride`` thins the rows of its fit.
     """
 
     share: float
     least: float
+    stride: int = 1
 
     def most_left(self, top: float) -> float:
         """Return the largest share of an output's mean square that a refined candidate may leave.
@@ -90,10 +91,9 @@ def fit_one(
     problem: Problem,
     current: Fit,
     candidate: Candidate,
-    stride: int,
+    ground: Ground,
     tops: dict[str, float],
     effort: Effort,
-    ground: Ground,
 ) -> Trial:
     """Fit a candidate jointly with the current model and compare them on held-out samples.
 
@@ -108,7 +108,7 @@ def fit_one(
     if is_wide(problem, current.model):
         fitted = fit_beside(problem, model, current, ground, candidate.starts, hopeless=limit)
         return Trial(candidate.placed, candidate, fitted, compare(problem, current, fitted), misfits(problem, fitted))
-    thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
+    thin = max(effort.stride, rows.size * len(now) // TRIAL_ROWS)
     fitted = fit(
         problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
         keep=current, touched=touched,
@@ -194,7 +194,7 @@ def try_all(
     for c in chosen:
         for o in c.placed.outputs:
             tops[o] = max(tops[o], c.share / len(c.placed.outputs) / part[o])
-    fitted = iter(run(fit_one, chosen, (stride, tops, effort, ground), f"{what}: fit"))
+    fitted = iter(run(fit_one, chosen, (ground, tops, replace(effort, stride=stride)), f"{what}: fit"))
     return [next(fitted) if k else Trial(c.placed, c, None, None, {}) for c, k in zip(screened, keep, strict=True)]
 
 
