@@ -81,7 +81,7 @@ def test_an_integrator_keeps_the_speed_that_its_window_shows() -> None:
 @pytest.mark.parametrize("length", [5, 256, 257, 5000])
 def test_the_shape_of_a_response_holds_its_beginning_and_later_samples(length: int) -> None:
     a, c = plant()
-    free, shape = free_response(a, c, length), response_shape(a, c, length, ())
+    free, shape = free_response(a, c, length), response_shape(a, c, length)
     np.testing.assert_allclose(shape[: min(length, 256)], free[:256])
     last = 1
     while 256 * last < length:

@@ -44,10 +44,10 @@ class Beside(Projected):
     def __init__(self, problem: Problem, model: Model, current: Fit, ground: Ground, most_rows: int) -> None:
         super().__init__(problem, model, problem.twin.outputs, 1)
         own, weights = model.slices(len(model.placed) - 1)
-        mine = {*range(own.start, own.stop), *range(weights.start, weights.stop)}
-        self.free = [i for i in model.nonlinear if i in mine]
-        self.linear = np.array([j for j in model.linear if j in mine], int)
-        self.penalty = model.penalty[:, [i for i, j in enumerate(model.linear) if j in mine]]
+        its_own = {*range(own.start, own.stop), *range(weights.start, weights.stop)}
+        self.free = [i for i in model.nonlinear if i in its_own]
+        self.linear = np.array([j for j in model.linear if j in its_own], int)
+        self.penalty = model.penalty[:, [i for i, j in enumerate(model.linear) if j in its_own]]
         self.lo = np.array([model.parameters[j].lo for j in self.linear])
         self.hi = np.array([model.parameters[j].hi for j in self.linear])
         self.believed = np.zeros(0, int)
