@@ -169,16 +169,6 @@ class AnalogOutput(Protocol):
         ...
 
 
-@runtime_checkable
-class BuffersScans(Protocol):
-    """Defines an ``AnalogInputScan`` whose device keeps few scans, and whose driver can keep more."""
-
-    def take_in(self) -> None:
-        """Take what the device holds into the driver's memory, without waiting; ``read_scans`` delivers it and says
-        what is wrong with it."""
-        ...
-
-
 ARMING_STEP_S = 0.001
 """Time that passes after each step of ``ArmsInSteps.arming``."""
 

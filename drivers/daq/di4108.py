@@ -196,15 +196,6 @@ class Di4108:
         self._receive(0.0 if kernels.scans_ready(stream) else timeout_s)
         return self.block_of(*kernels.decode(stream, self._bytes, out))
 
-    def take_in(self) -> None:
-        """See ``BuffersScans``: the device's FIFO holds 1024 samples."""
-        stream, end = self._stream, int(self._stream["end"][0])
-        if stream["overflowed"][0] or end == BUFFER_BYTES:
-            return
-        n = self.port.read_into(self._view[end:], 0.0)
-        if n and self._kernels.accept(stream, self._bytes, n, self._clock.now_ns()) == self._kernels.OVERFLOWED:
-            self._scanning = False
-
     def block_of(self, n: int, t0_ns: int, seq0: int, lost: int, shifted: bool) -> ScanBlock:
         """Return what ``decode`` has just found as ``read_scans`` does; a compiled loop hands over scans with it."""
         stream = self._stream

@@ -243,6 +243,7 @@ class CompiledMicron(Micron):
         words[at.SEQ_OF_TICK0], words[at.LAST_K], words[at.LAST_DUE_NS] = seq_of_tick0, last_k, last_due_ns
         words[at.WARNED], words[at.READS_LEFT] = self._warned, -1
         memory.sinks.page_frame[:] = self.frame
+        self._output.begin()
         if self._is_virtual:
             self._feed(last_due_ns)
         words[at.BEAT_NS] = self.run.clock.now_ns()

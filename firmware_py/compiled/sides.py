@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol, cast
 
@@ -24,6 +25,9 @@ from hal.i2c_carrier import PYTHON, I2cCarrier
 from hal.middleware.share import CanView
 from hal.types import I2cOp
 
+LONGEST_FRAME = 72
+"""Size of ``struct canfd_frame``: one read of a CAN socket takes one frame."""
+
 
 class Side(Protocol):
     """Stands for the Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes."""
@@ -42,6 +46,10 @@ class Side(Protocol):
         ...
 
     def fileno(self) -> int: ...
+    def begin(self) -> None:
+        """Pass over what has come for the thread while Python was at work."""
+        ...
+
     def take_over(self, is_read_back: bool) -> None:
         """Hand to the driver what the thread has left to it. ``is_read_back``: it came from reading back."""
         ...
@@ -81,6 +89,9 @@ class E727Side:
 
     def take_over(self, is_read_back: bool) -> None:
         """The driver's memory is as it needs it."""
+
+    def begin(self) -> None:
+        """The thread reads the driver's own port."""
 
     def catch_up(self) -> None:
         """The thread reads the driver's own port."""
@@ -273,6 +284,9 @@ class DacSide:
             assert self._carrier is not None
             self._driver.pending = self._carrier.failure(failed, self._driver.address)
 
+    def begin(self) -> None:
+        """A DAC sends nothing by itself."""
+
     def catch_up(self) -> None:
         """A DAC sends nothing by itself."""
 
@@ -340,6 +354,17 @@ class CanSide:
             self._driver.pending = self._driver.wrong_status(int(self._memory.line.received[LENGTH_AT]))
         else:
             self._driver.pending = self._carrier.failure(failed)
+
+    def begin(self) -> None:
+        """The thread's connection holds what the node said since the thread ran last, or was made: all of it is old,
+        and some of it says that the node was not armed."""
+        if isinstance(self._carrier, VirtualCan):
+            return
+        with contextlib.suppress(HalError):  # the thread's next call says it
+            self._driver.poll()
+        with contextlib.suppress(OSError):
+            while os.read(self.fileno(), LONGEST_FRAME):
+                pass
 
     def catch_up(self) -> None:
         if not isinstance(self._carrier, VirtualCan):

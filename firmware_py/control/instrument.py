@@ -106,8 +106,11 @@ class Micron:
         self.scans.take_none(self.run.clock.now_ns())
         return self._ticker.tick_without_scan()
 
-    def take_in(self) -> None:
-        self.scans.take_in()
+    def poll(self) -> Ticks | None:
+        try:
+            return self._ticker.poll()
+        except HalError:  # it has been reported
+            return None
 
     def look_at(self, ticks: Ticks) -> None:
         self.scans.look_at(ticks)

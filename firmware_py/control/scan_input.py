@@ -6,7 +6,6 @@ awake (``Run.host_stalled_ms``).
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 
 import numpy as np
@@ -15,7 +14,6 @@ from firmware_py.control.wiring import Daq
 from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding, finding_of_scans
 from firmware_py.scheduler.ticker import Ticks
-from hal.contracts import BuffersScans
 from hal.errors import HalError
 from hal.types import ScanBlock, Status, TimeSource
 
@@ -79,12 +77,6 @@ class ScanInput:
             self._counts.lost += block.lost
         self._counts.expected += block.n + block.lost
         return block
-
-    def take_in(self) -> None:
-        """Let the driver keep what the DAQ has no room for; the next ``read`` says what is wrong with it."""
-        if isinstance(self._daq, BuffersScans) and not self.failed:
-            with contextlib.suppress(HalError):
-                self._daq.take_in()
 
     def hand_over(self, take: Callable[[], ScanBlock]) -> None:
         """Let the next ``read`` return ``take()``, a block that a compiled loop has put into ``rows``, or fail with

@@ -167,8 +167,8 @@ class Endoscope:
     def wait(self) -> Ticks | None:
         return self._ticker.wait()
 
-    def take_in(self) -> None:
-        pass
+    def poll(self) -> Ticks | None:
+        return None
 
     def look_at(self, ticks: Ticks) -> None:
         if self._until_done and self.view.game.done:

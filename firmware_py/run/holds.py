@@ -23,6 +23,7 @@ class Holds:
         self._supervisor = supervisor
         self._good_since_ns = 0
         self._last_ready_ns = 0
+        self._refused: tuple[Hold, int] | None = None
         self._is_ready = False
         self._asked = False
 
@@ -66,7 +67,7 @@ class Holds:
     def wait_out_host(self, now_ns: int, reason: str) -> None:
         """Exclude a stall of the host within a hold from the hold's time limit. A hold that the host caused takes
         ``reason`` as its own."""
-        self._last_ready_ns = now_ns
+        self._last_ready_ns, self._refused = now_ns, None
         hold = self.current
         if hold is not None and hold.finding is Finding.HOST_OVERSLEPT:
             hold.reason = reason
@@ -74,11 +75,22 @@ class Holds:
     def wait_for(self, now_ns: int, what: str) -> None:
         """Let the hold wait for ``what``, which has a time limit of its own and does not count towards the hold's."""
         self.interrupt(now_ns, what)
-        self._last_ready_ns = now_ns
+        self._last_ready_ns, self._refused = now_ns, None
+
+    def note_refusal(self, now_ns: int) -> None:
+        """Note that the outputs could not be armed, although the hold was to end by itself."""
+        hold = self.current
+        if hold is None or self._limits.rearm != "automatic":
+            return
+        if self._refused is None or self._refused[0] is not hold:
+            self._refused = hold, now_ns
 
     def is_too_long(self, now_ns: int) -> bool:
-        """Return True if the hold has not become good within ``hold_limit_ms``."""
+        """Return True if the hold has not become good within ``hold_limit_ms``, or has not been able to end for as long
+        because the outputs could not be armed."""
         hold = self.current
+        if self._refused is not None and self._refused[0] is hold:
+            return (now_ns - self._refused[1]) * 1e-6 >= self._limits.hold_limit_ms
         if hold is None or self._is_ready:
             return False
         return (now_ns - max(hold.t_ns, self._last_ready_ns)) * 1e-6 >= self._limits.hold_limit_ms

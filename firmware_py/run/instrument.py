@@ -80,8 +80,8 @@ class Instrument(Protocol):
         """Return the next ticks, or ``None`` where the loop must not wait any more."""
         ...
 
-    def take_in(self) -> None:
-        """Take what devices hold that keep little, without waiting; called while the outputs are being armed."""
+    def poll(self) -> Ticks | None:
+        """Return the ticks that have become due, without waiting; called while the outputs are being armed."""
         ...
 
     def look_at(self, ticks: Ticks) -> None:

@@ -149,16 +149,21 @@ class Loop:
             run.supervisor.arm(self._pass_arming_step)
         except HalError as error:
             run.incidents.report_error(Finding.OUTPUT_FAILED, self._output_name, error)
-        else:
+            return
+        if run.supervisor.may_move:
             run.armed_ns = run.clock.now_ns()
             run.end_ns = run.armed_ns + round(seconds * 1e9)
 
     def _pass_arming_step(self) -> None:
-        """Let the time after a step of arming pass, in which devices go on sending."""
-        clock = self._run.clock
-        until_ns = clock.now_ns() + round(ARMING_STEP_S * 1e9)
-        self._instrument.take_in()
-        clock.sleep_until_ns(until_ns)
+        """Let the time after a step of arming pass. Scans that come meanwhile are not kept waiting: the DAQ has little
+        room for them, and a node that was armed does not wait for a loop that catches up."""
+        run = self._run
+        until_ns = run.clock.now_ns() + round(ARMING_STEP_S * 1e9)
+        if (ticks := self._instrument.poll()) is not None:
+            run.ticks = ticks
+            for i in range(ticks.n):
+                run.scheduler.catch_up(ticks.due_ns + i * ticks.dt_ns, ticks.k0 + i)
+        run.clock.sleep_until_ns(until_ns)
 
     @property
     def _output_name(self) -> str:
@@ -196,7 +201,9 @@ class Loop:
             run.supervisor.resume(self._pass_arming_step)
         except HalError as error:
             run.incidents.report_error(finding_of_output(error), self._output_name, error)
-        else:
+            run.incidents.holds.note_refusal(run.clock.now_ns())
+            return
+        if run.supervisor.may_move:
             run.incidents.end_hold()
 
     # -- the end ------------------------------------------------------------------------------------------

@@ -219,10 +219,12 @@ class Supervisor:
             self._arm_output(meanwhile)
 
     def _arm_output(self, meanwhile: Callable[[], object] | None) -> None:
-        output = self._output
+        output, state = self._output, self.state
         if meanwhile is not None and isinstance(output, ArmsInSteps):
             for _ in output.arming():
                 meanwhile()
+                if self.state is not state:  # something was found in the meantime
+                    return
         elif output is not None:
             output.arm()
         self.state = State.RUNNING

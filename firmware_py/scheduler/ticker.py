@@ -96,6 +96,11 @@ class ScanTicker:
             if self._clock.now_ns() + ROUNDING_NS >= limit_ns:
                 return self._host_tick(self._last_due_ns)
 
+    def poll(self) -> Ticks | None:
+        """Return the block of scans that has come, ``None`` if there is none. Errors of ``read`` propagate."""
+        block = self._read(0.0)
+        return self._scans(block) if block.n else None
+
     @property
     def place(self) -> tuple[int, int, int] | None:
         """Return the sequence number of tick 0, the last tick and its due time (ns), for a compiled loop to go on from;

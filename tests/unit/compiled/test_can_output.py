@@ -74,6 +74,10 @@ class Stand:
             # frames are stamped by the real clock, which must not be behind the time that the test has moved
             self.clock.sleep_until_ns(int(self.now_ns[0]))
 
+    def has_unread(self) -> bool:
+        """Return True while frames wait on the thread's own connection."""
+        return bool(select.select([self.side.fileno()], (), (), 0.0)[0])
+
     def write(self, *volts: float) -> int:
         return write(self.memory, self.side.fileno(), np.array(volts))[0]
 
@@ -160,3 +164,12 @@ def test_the_ramp_is_over_when_the_node_says_so(stand: Stand):
     assert done
     assert stand.node.codes == [NEUTRAL] * 3
     assert list(stand.driver.commanded_V) == [50.0] * 3
+
+
+def test_what_the_node_said_before_the_thread_ran_is_passed_over(stand: Stand) -> None:
+    """Its connection was made before the node was armed, and received that."""
+    assert stand.has_unread()
+    stand.side.begin()
+    assert not stand.has_unread()
+    assert stand.write(50.0, 50.0, 50.0) == SENT
+    assert stand.driver.state == 1

@@ -109,6 +109,25 @@ def test_no_holds_at_all():
     assert stand.trip == "daq: no new scan for 5 ms; check its link"
 
 
+def test_a_hold_whose_outputs_cannot_be_armed_is_given_up():
+    stand = Stand().held()
+    for _ in range(15):
+        assert stand.may_end_after(200.0)
+        stand.holds.note_refusal(stand.clock.now_ns())
+        stand.holds.interrupt(stand.clock.now_ns(), "piezo: no answer")
+        assert not stand.holds.is_too_long(stand.clock.now_ns())
+    stand.clock.burn_ns(200 * MS)
+    assert stand.holds.is_too_long(stand.clock.now_ns())
+
+
+def test_a_person_may_try_again_at_any_time():
+    stand = Stand(rearm="operator").held()
+    assert not stand.may_end_after(200.0)
+    stand.holds.note_refusal(stand.clock.now_ns())
+    assert not stand.may_end_after(10_000.0)
+    assert not stand.holds.is_too_long(stand.clock.now_ns())
+
+
 def test_a_hold_that_does_not_become_good_is_given_up():
     stand = Stand().held()
     for _ in range(29):

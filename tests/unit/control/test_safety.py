@@ -1,5 +1,7 @@
 """The supervisor: nothing moves before the self-test, the first reason wins, neutral within 20 ms."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,33 @@ def test_no_motion_before_the_self_test():
     assert not supervisor.may_move
     supervisor.arm()
     assert supervisor.may_move
+
+
+class InSteps(FakeAmplifier):
+    """An amplifier that is armed in three steps."""
+
+    def arming(self) -> Iterator[None]:
+        for _ in range(3):
+            yield
+        self.arm()
+
+
+def test_what_is_found_between_the_steps_of_arming_ends_it():
+    amplifier = InSteps()
+    supervisor = Supervisor(amplifier)
+    supervisor.begin_self_test()
+    passed: list[int] = []
+
+    def meanwhile() -> None:
+        passed.append(1)
+        if len(passed) == 2:
+            supervisor.trip(Finding.BUTTON_PRESSED, "stop button", tick=7, t_ns=7_000_000)
+
+    supervisor.arm(meanwhile)
+    assert len(passed) == 2
+    assert not supervisor.may_move
+    assert supervisor.state is State.SAFE_RAMP
+    assert not amplifier.armed
 
 
 def test_failed_self_test_leaves_everything_disarmed():

@@ -217,21 +217,6 @@ def test_fifo_overflow_delivers_the_good_scans_then_raises():
         daq.read_scans(out, 0.01)
 
 
-def test_what_was_taken_in_is_delivered_in_order_and_its_end_is_told():
-    daq, _, _ = scanning(
-        ("at", 10 * MS), ("r", scan(1) + scan(2)), ("at", 20 * MS), ("r", scan(3)[:5]), ("r", scan(3)[5:] + scan(4)),
-        ("r", b"stop 01"),
-    )  # fmt: skip
-    for _ in range(5):  # one more than there is something to read
-        daq.take_in()
-    out = np.zeros((8, 8), dtype=np.int16)
-    block = daq.read_scans(out, 0.01)
-    assert (block.n, block.seq0, block.lost) == (4, 0, 0)
-    assert out[:4, 0].tolist() == [1, 2, 3, 4]
-    with pytest.raises(Overrun, match="stopped itself"):
-        daq.read_scans(out, 0.01)
-
-
 def test_overflow_tail_in_two_pieces():
     daq, _, _ = scanning(("r", scan(1) + b"sto"), ("r", b"p 01"))
     out = np.zeros((8, 8), dtype=np.int16)
