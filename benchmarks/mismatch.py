@@ -70,6 +70,44 @@ def axis_recording(seconds: float):
     )  # fmt: skip
 
 
+ORDERS = ((16, 1, 3), (64, 2, 2))
+"""Numbers of states, inputs and outputs of the state spaces of which a column is measured."""
+
+
+def column_s(order: int, inputs: int, outputs: int) -> tuple[float, int]:
+    """(CPU s of a column of the Jacobian of the poles, linear parameters that are solved anew in each): two minutes at
+    400 Hz of lightly damped modes in noise.
+    """
+    from tools.mismatch.engine.fit import slopes
+    from tools.mismatch.engine.pose import make_split
+    from tools.mismatch.engine.problem import Problem
+    from tools.mismatch.engine.projected import Projected
+    from tools.mismatch.recording import Recording, Split, TwinText
+    from tools.mismatch.twins.make import make
+
+    n, rate_hz, rng = 48_000, 400.0, np.random.default_rng(order)
+    a = np.zeros((order, order))
+    for i, w in enumerate(np.exp(np.linspace(np.log(5.0), np.log(400.0), order // 2))):
+        a[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[0.0, w], [-w, -0.02 * w]]
+    b, c = rng.standard_normal((order, inputs)), rng.standard_normal((outputs, order))
+    signals = {f"u{i}": rng.standard_normal(n) for i in range(inputs)}
+    measured = {f"y{k}": rng.standard_normal(n) for k in range(outputs)}
+    names = (*signals, *measured)
+    text = TwinText("state_space", {"A": a.tolist(), "B": b.tolist(), "C": c.tolist()}, ())
+    recording = Recording(
+        Path("benchmark.toml"), "benchmark", np.arange(n) / rate_hz, 1.0 / rate_hz, signals, measured, {},
+        dict.fromkeys(measured), dict.fromkeys(names, "V"), {s: s for s in names}, text, Split(),
+    )  # fmt: skip
+    twin = make(recording)
+    problem = Problem(recording, twin, make_split(recording, 0.3, 0, False), 0, 0, settle=True)
+    model = problem.base()
+    projected = Projected(problem, model, twin.outputs, 12_000 // outputs)
+    residual, theta = projected.evaluate(model.start(recording))
+    cpu = time.process_time()
+    slopes(projected, theta, residual)
+    return (time.process_time() - cpu) / len(projected.free), len(model.linear)
+
+
 def measure(seconds: float, jobs: int, make: Callable[[float], Any] = stack_recording) -> tuple[float, float, int]:
     """(wall s, CPU s of this process, candidates that were screened)."""
     from tools.mismatch.infer import diagnose
@@ -149,4 +187,12 @@ def rows() -> Iterator[Row]:
         "mismatch, growth with length", f"exponent of CPU; s of CPU for {each}{left_out}", grows, 1.0, "linear", "1",
         grows, "<= 1.2", grows <= 1.2, must=True,
     )  # fmt: skip
+    column_s(4, 1, 1)  # kernels compiled or read
+    for order, inputs, outputs in ORDERS:
+        cost, solved = column_s(order, inputs, outputs)
+        yield Row(
+            f"mismatch, column of order {order}",
+            f"CPU of a derivative by a pole; {inputs} in, {outputs} out, {solved} linear parameters, 48 000 samples",
+            1e3 * cost, np.nan, "", "ms", np.nan,
+        )  # fmt: skip
     yield from peers(stack_recording(minute_s))

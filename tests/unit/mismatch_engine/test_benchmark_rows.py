@@ -22,6 +22,7 @@ def rows_of(monkeypatch: pytest.MonkeyPatch, wall_per_recorded_s: float) -> dict
 
     monkeypatch.delenv("MICRON_BENCH_LONG", raising=False)
     monkeypatch.setattr(mismatch, "measure", measured)
+    monkeypatch.setattr(mismatch, "column_s", lambda order, inputs, outputs: (0.02, 51))
     monkeypatch.setattr(mismatch, "peers", lambda recording: iter(()))
     monkeypatch.setattr(mismatch, "stack_recording", lambda seconds: None)
     monkeypatch.setattr(mismatch, "time", SimpleNamespace(perf_counter=lambda: now_s))
