@@ -130,6 +130,7 @@ def _follow_clock(tables: dict[str, dict[str, Any]], tick_hz: float, where: str)
         raise BenchError(
             f"{where}: firmware.actuation: the taps of feedforward are for ticks of {TAPS_HZ:g} Hz, this bench has "
             f"{tick_hz:g} Hz: calibrate the stacks at that rate and name it there (tick_hz), or set feedforward = [1.0]"
+            " where they are (calibration files override the bench)"
         )
     for name in STAGES:
         given = tables[name].setdefault("tick_hz", tick_hz)
