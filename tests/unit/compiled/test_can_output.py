@@ -58,6 +58,7 @@ class Stand:
         self.bus.send(_command(1), 0.0)
         self.pass_ms(5)  # the node arms, and says so in a STATUS
         self.driver.poll()
+        self.now_ns[0] = clock.now_ns()  # the driver has used the real clock, and loading kernels takes a while
         self.driver.node.words[COUNTER] = self.driver.node.words[ACKNOWLEDGED] + 1  # as ``arm`` does
         self.driver.guard.armed = True
         assert self.driver.state == 1
