@@ -106,8 +106,10 @@ def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
     on = _Trial(u, y, rec.dt, twin.hold, used, judged)
     ends = [_left(on, *s) for s in ((pure, whole), (whole, pure), (pure, given), (given, pure))]
     found: list[tuple[float, int, tuple[Filter, Filter]]] = []
-    for i, pair in enumerate(itertools.islice(_splits(whole, twin.hold, rec.dt), MOST_SPLITS)):
-        found.append((_left(on, *pair), i, pair))
+    # a curve inside bends the poles of a re-fitted twin
+    for of in dict.fromkeys((whole, given)):
+        for pair in itertools.islice(_splits(of, twin.hold, rec.dt), MOST_SPLITS):
+            found.append((_left(on, *pair), len(found), pair))
     if not found:
         return None
     left, _, (first, second) = min(found, key=lambda f: f[:2])
