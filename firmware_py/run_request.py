@@ -14,6 +14,7 @@ from typing import Any
 from drivers.specs import check_devices
 from firmware_py.machine.settings import read_machine
 from firmware_py.machine.tree import Tree
+from firmware_py.machine.workers import WORKER_PRIORITY
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.bench import BenchFile, OpenBench, Port, SerialSpec, open_bench
 from hal.clock import Pace, PacedClock
@@ -21,8 +22,6 @@ from hal.contracts import Clock
 from hal.errors import Disconnected
 
 LOOP_PRIORITY = 80
-WORKER_PRIORITY = 70
-"""SCHED_FIFO priority of the kernel's threads that bring the bytes of ttys: between the loop and other programs."""
 
 
 @dataclass(frozen=True)

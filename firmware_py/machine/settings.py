@@ -15,7 +15,12 @@ from typing import Literal
 
 from firmware_py.machine.processors import format_processors, parse_processors
 from firmware_py.machine.tree import DMA_LATENCY, Tree, read_latency_limit_us
-from firmware_py.machine.workers import find_workers, has_ordinary_workers, may_raise
+from firmware_py.machine.workers import (
+    find_workers,
+    has_left_workers,
+    has_ordinary_workers,
+    may_raise,
+)
 
 Lasts = Literal["run", "boot", "kernel"]
 CPUS = "sys/devices/system/cpu"
@@ -62,6 +67,10 @@ def _latency_limit(tree: Tree, _ports: Sequence[str]) -> list[Reading]:
 def _tty_workers(tree: Tree, _ports: Sequence[str]) -> list[Reading]:
     if not find_workers(tree):
         return []
+    if has_left_workers(tree):
+        return [
+            Reading("proc", WORKERS, "real-time priority, which a killed run has left; the next run lowers it", False)
+        ]
     if not has_ordinary_workers(tree):
         return [Reading("proc", WORKERS, "real-time priority", True)]
     is_ours = may_raise(tree)

@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable
 
 from firmware_py.machine.tree import Tree
 
+WORKER_PRIORITY = 70
+"""SCHED_FIFO priority of these threads in a run: between the loop and other programs."""
+NAME = "micron-workers"
+"""Name of the process that keeps them raised (``firmware_py.machine.attendant``)."""
 PREFIX = "kworker/u"
 CAP_SYS_NICE = 23
 RT_PRIORITY_AT = 37
@@ -22,14 +25,33 @@ RT_PRIORITY_AT = 37
 
 def find_workers(tree: Tree) -> list[int]:
     """Return the process ids of the kernel's threads for unbound work."""
-    names = [name for name in tree.names("proc/[1-9]*/comm") if (tree.read(name) or "").startswith(PREFIX)]
+    return _named(tree, PREFIX)
+
+
+def _named(tree: Tree, prefix: str) -> list[int]:
+    names = [name for name in tree.names("proc/[1-9]*/comm") if (tree.read(name) or "").startswith(prefix)]
     return [int(name.split("/")[1]) for name in names]
+
+
+def _priorities(tree: Tree) -> set[str]:
+    stats = [(tree.read(f"proc/{pid}/stat") or "").rpartition(")")[2].split() for pid in find_workers(tree)]
+    return {stat[RT_PRIORITY_AT] for stat in stats if len(stat) > RT_PRIORITY_AT}
 
 
 def has_ordinary_workers(tree: Tree) -> bool:
     """Return True if one of these threads has no real-time policy."""
-    stats = [tree.read(f"proc/{pid}/stat") or "" for pid in find_workers(tree)]
-    return any(stat.rpartition(")")[2].split()[RT_PRIORITY_AT : RT_PRIORITY_AT + 1] == ["0"] for stat in stats)
+    return "0" in _priorities(tree)
+
+
+def has_left_workers(tree: Tree) -> bool:
+    """Return True if one of these threads has the priority that a run gives it, and no run is under way: the run and
+    its attendant were killed."""
+    return str(WORKER_PRIORITY) in _priorities(tree) and not has_attendant(tree)
+
+
+def has_attendant(tree: Tree, *, besides_us: bool = False) -> bool:
+    """Return True if a process keeps the threads raised. ``besides_us``: another one than this process."""
+    return any(pid != os.getpid() or not besides_us for pid in _named(tree, NAME))
 
 
 def may_raise(tree: Tree) -> bool:
@@ -39,21 +61,19 @@ def may_raise(tree: Tree) -> bool:
     return bool(int(held, 16) >> CAP_SYS_NICE & 1)
 
 
-def raise_workers(tree: Tree, priority: int) -> Callable[[], None]:
-    """Give the threads that are there SCHED_FIFO with ``priority``, and return what undoes it.
-
-    A thread that the kernel starts later has ordinary priority. Threads stay raised if this process is killed. Raises
+def raise_workers(tree: Tree, priority: int) -> None:
+    """Give the threads that are there and have ordinary priority SCHED_FIFO with ``priority``. Raises
     ``PermissionError`` without the right to do so."""
-    raised: list[int] = []
     for pid in find_workers(tree):
         with contextlib.suppress(ProcessLookupError):  # the kernel ends idle ones
             if os.sched_getscheduler(pid) == os.SCHED_OTHER:
                 os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(priority))
-                raised.append(pid)
 
-    def undo() -> None:
-        for pid in set(raised).intersection(find_workers(tree)):
-            with contextlib.suppress(ProcessLookupError):
+
+def lower_workers(tree: Tree, priority: int) -> None:
+    """Give the threads that have SCHED_FIFO with ``priority`` ordinary priority, also those that a killed run has
+    left."""
+    for pid in find_workers(tree):
+        with contextlib.suppress(ProcessLookupError):
+            if os.sched_getscheduler(pid) == os.SCHED_FIFO and os.sched_getparam(pid).sched_priority == priority:
                 os.sched_setscheduler(pid, os.SCHED_OTHER, os.sched_param(0))
-
-    return undo

@@ -13,8 +13,8 @@ from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
+from firmware_py.machine.attendant import attend_workers
 from firmware_py.machine.tree import MACHINE, Tree, hold_latency_limit
-from firmware_py.machine.workers import raise_workers
 
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h, Linux
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
@@ -81,12 +81,12 @@ def realtime(config: RealtimeConfig, tree: Tree = MACHINE) -> Generator[Realtime
         if idle_us is not None:
             wanted = "idle states off" if idle_us == 0 else f"idle states of {idle_us} us"
             attempt("idle_states", wanted, lambda: hold_latency_limit(tree, idle_us))
+        if (worker := config.worker_priority) is not None:  # before the pinning, which its process would inherit
+            attempt("tty_workers", f"SCHED_FIFO {worker}", lambda: attend_workers(worker))
         if cpu is not None:
             attempt("cpu", f"cpu {cpu}", lambda: _pin(cpu))
         if slack_ns is not None:
             attempt("timer_slack", f"{slack_ns} ns", lambda: _timer_slack(slack_ns))
-        if (worker := config.worker_priority) is not None:
-            attempt("tty_workers", f"SCHED_FIFO {worker}", lambda: raise_workers(tree, worker))
         if config.lock_memory:
             attempt("lock_memory", "touched memory locked", _lock_memory)
         if config.freeze_gc:

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
-from firmware_py.run_request import LOOP_PRIORITY, WORKER_PRIORITY, RunRequest
+from firmware_py.machine.workers import WORKER_PRIORITY
+from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.children import child_command, child_environment

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from firmware_py.machine.attendant import attend, attend_workers
 from firmware_py.machine.processors import format_processors, parse_processors
 from firmware_py.machine.settings import SETTINGS, MachineState, read_machine, set_machine
 from firmware_py.machine.tree import DMA_LATENCY, Tree, hold_latency_limit, read_latency_limit_us
-from firmware_py.machine.workers import has_ordinary_workers, raise_workers
+from firmware_py.machine.workers import (
+    NAME,
+    WORKER_PRIORITY,
+    has_attendant,
+    has_ordinary_workers,
+    lower_workers,
+    may_raise,
+    raise_workers,
+)
 from firmware_py.scheduler import RealtimeConfig, realtime
 from tools.cli.main import app
 from tools.diagnose.findings import setting_findings
@@ -188,45 +198,80 @@ def test_a_run_reports_idle_states_as_one_of_its_settings(lab: Tree):
 
 
 class Policies:
-    """Stands for the kernel's table of scheduling policies."""
+    """Stands for the kernel's table of scheduling policies and their priorities."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, table: dict[int, int]) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, table: dict[int, tuple[int, int]]) -> None:
         self.table = table
-        self.priorities: list[int] = []
-        monkeypatch.setattr(os, "sched_getscheduler", self.get)
+        monkeypatch.setattr(os, "sched_getscheduler", lambda pid: self.get(pid)[0])
+        monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(self.get(pid)[1]))
         monkeypatch.setattr(os, "sched_setscheduler", self.set)
 
-    def get(self, pid: int) -> int:
+    def get(self, pid: int) -> tuple[int, int]:
         if pid not in self.table:
             raise ProcessLookupError(3, "No such process")
         return self.table[pid]
 
     def set(self, pid: int, policy: int, param: os.sched_param) -> None:
         self.get(pid)
-        self.table[pid] = policy
-        self.priorities.append(param.sched_priority)
+        self.table[pid] = policy, param.sched_priority
 
 
-def test_workers_of_ttys_are_raised_and_those_that_were_ordinary_lowered_again(
+def add_processes(lab: Tree, **names: str) -> None:
+    for pid, name in names.items():
+        (lab.root / f"proc/{pid[1:]}").mkdir()
+        (lab.root / f"proc/{pid[1:]}/comm").write_text(f"{name}\n")
+
+
+def test_workers_of_ttys_are_raised_and_those_of_a_killed_run_lowered_as_well(
     lab: Tree, monkeypatch: pytest.MonkeyPatch
 ):
-    for pid in (14, 15, 16):
-        (lab.root / f"proc/{pid}").mkdir()
-        (lab.root / f"proc/{pid}/comm").write_text(f"kworker/u8:{pid}\n")
-    other, fifo = os.SCHED_OTHER, os.SCHED_FIFO
-    policies = Policies(monkeypatch, {12: other, 13: other, 14: fifo, 15: other})  # the kernel has ended 16
-    undo = raise_workers(lab, 70)
-    assert policies.table == {12: fifo, 13: other, 14: fifo, 15: fifo}
-    assert policies.priorities == [70, 70]
+    add_processes(lab, p14="kworker/u8:14", p15="kworker/u8:15", p16="kworker/u8:16", p17="kworker/u8:17")
+    other, fifo = (os.SCHED_OTHER, 0), (os.SCHED_FIFO, WORKER_PRIORITY)
+    somebodys = os.SCHED_FIFO, 50
+    # a killed run has left 14, somebody else has raised 17, and the kernel has ended 16
+    policies = Policies(monkeypatch, {12: other, 13: other, 14: fifo, 15: other, 17: somebodys})
+    raise_workers(lab, WORKER_PRIORITY)
+    assert policies.table == {12: fifo, 13: other, 14: fifo, 15: fifo, 17: somebodys}
     del policies.table[15]
-    undo()
-    assert policies.table == {12: other, 13: other, 14: fifo}
+    lower_workers(lab, WORKER_PRIORITY)
+    assert policies.table == {12: other, 13: other, 14: other, 17: somebodys}
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_the_attendant_lowers_them_when_the_last_run_is_over(lab: Tree, monkeypatch: pytest.MonkeyPatch, others: bool):
+    add_processes(lab, **{f"p{os.getpid()}": NAME}, **({"p77": NAME} if others else {}))
+    raised = os.SCHED_FIFO, WORKER_PRIORITY
+    policies = Policies(monkeypatch, {12: raised})
+    ours, runs = os.pipe()
+    os.close(runs)  # what the kernel does when the run dies
+    attend(lab, WORKER_PRIORITY, ours)
+    os.close(ours)
+    assert policies.table == {12: raised if others else (os.SCHED_OTHER, 0)}
+
+
+@pytest.mark.realtime
+def test_the_attendant_ends_with_its_run():
+    """As a process: it is there while the block lasts, where this user may have it."""
+    if not may_raise(Tree()):
+        pytest.skip("needs the capability CAP_SYS_NICE")
+    end = attend_workers(WORKER_PRIORITY)
+    assert has_attendant(Tree())
+    end()
+
+
+def test_what_a_killed_run_has_left_is_told(lab: Tree):
+    stat = lab.root / "proc/12/stat"
+    stat.write_text(stat.read_text().replace(" 0 0 0\n", f" {WORKER_PRIORITY} 1 0\n"))
+    assert "a killed run has left" in states(lab)["workers of ttys"].describe()
+    assert not states(lab)["workers of ttys"].is_good
+    add_processes(lab, p77=NAME)
+    assert states(lab)["workers of ttys"].describe() == "real-time priority"
 
 
 def test_raised_workers_are_told_from_ordinary_ones(lab: Tree):
     stat = lab.root / "proc/12/stat"
     assert has_ordinary_workers(lab)
-    stat.write_text(stat.read_text().replace(" 0 0 0\n", " 70 1 0\n"))
+    stat.write_text(stat.read_text().replace(" 0 0 0\n", " 60 1 0\n"))
     assert not has_ordinary_workers(lab)
     assert states(lab)["workers of ttys"].is_good
 
@@ -236,17 +281,15 @@ def test_who_may_raise_them_is_read_from_the_capabilities(lab: Tree):
     assert states(lab)["workers of ttys"].describe() == "ordinary priority, but a run raises it"
 
 
-def test_a_run_that_may_not_raise_them_says_so(lab: Tree, monkeypatch: pytest.MonkeyPatch):
-    def refuse(*_: object) -> None:
+def test_a_run_that_may_not_raise_them_says_so(monkeypatch: pytest.MonkeyPatch):
+    def refuse(_priority: int) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    policies = Policies(monkeypatch, {12: os.SCHED_OTHER})
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(sys.modules["firmware_py.scheduler.realtime"], "attend_workers", refuse)
     asked = RealtimeConfig(priority=None, lock_memory=False, timer_slack_ns=None, freeze_gc=False, worker_priority=70)
-    with realtime(asked, lab) as report:
+    with realtime(asked) as report:
         assert not report["tty_workers"].done
         assert "CAP_SYS_NICE" in report["tty_workers"].detail
-    assert policies.table == {12: os.SCHED_OTHER}
 
 
 def test_doctor_shows_and_sets_another_tree(lab: Tree):
