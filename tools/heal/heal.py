@@ -140,7 +140,7 @@ def heal(
                 kept, why = is_better(now, after)
         except InputError as error:
             candidate, after, kept, why = None, now, False, str(error)
-        steps.append(_step(part, compared, named, (kept, why), after, twin, balance))
+        steps.append(_step(part, compared, named, (kept, why), after, twin=twin, balance=balance))
         if kept and candidate is not None:
             bench, now = candidate, after
         else:
@@ -241,7 +241,7 @@ def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
 
 def _step(
     part: Part, compared: Comparison, named: tuple[tuple[str, ...], tuple[str, ...]], verdict: tuple[bool, str],
-    after: TipError, twin: StackTwin | None, balance: Balance,
+    after: TipError, *, twin: StackTwin | None, balance: Balance,
 ) -> Step:  # fmt: skip
     file = str(twin.file) if twin is not None and twin.file is not None else None
     split = twin.split if twin is not None else ()
