@@ -24,7 +24,7 @@ NULL = Stages(EIGHT).sensing.params["null"][0].copy()
 NULL /= np.linalg.norm(NULL, axis=0)
 """Direction of each axis in the plane of two parities."""
 BETWEEN = (NULL[:, 3] + NULL[:, 5]) / 2.0
-"""As near to axis 3 as to axis 5, and within 6 degrees of both."""
+"""This direction is as near to axis 3 as to axis 5, within 6 degrees of both."""
 
 
 class Bench:

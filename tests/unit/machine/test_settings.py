@@ -251,7 +251,7 @@ def test_the_attendant_lowers_them_when_the_last_run_is_over(lab: Tree, monkeypa
 
 @pytest.mark.realtime
 def test_the_attendant_ends_with_its_run():
-    """As a process: it is there while the block lasts, where this user may have it."""
+    """The process is there while the block lasts, where this user may have it."""
     if not may_raise(Tree()):
         pytest.skip("needs the capability CAP_SYS_NICE")
     end = attend_workers(WORKER_PRIORITY)

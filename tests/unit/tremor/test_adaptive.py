@@ -333,7 +333,7 @@ def test_errors_above_the_band_count_more(rate_hz: float) -> None:
 
 
 def test_motion_above_the_band_is_not_enlarged() -> None:
-    """Of motion at 18 to 24 Hz the filter that has learned a hand passes less than half as much."""
+    """A filter that has learned a hand passes less than half as much motion at 18 to 24 Hz."""
     record, hz = make_record(3, "two tones", 8.0), np.arange(18.0, 24.0, 0.5)
     passed: dict[float, float] = {}
     for above in (1.0, 10.0):

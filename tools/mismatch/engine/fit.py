@@ -271,16 +271,16 @@ def fit(
     for theta in best[:1] if give_up else best:
         cost, projected = np.inf, None
         if not give_up:
-            effort = Effort(min(rows, ground.fit_rows.size), iterations, rounds, tolerance)
-            theta, cost, count, projected = _finely(ground, model, outputs, theta, effort)
+            limits = Limits(min(rows, ground.fit_rows.size), iterations, rounds, tolerance)
+            theta, cost, count, projected = _finely(ground, model, outputs, theta, limits)
             evaluations += count
         if found is None or (np.isfinite(cost) and cost < found[0]):
             found, fitted = (cost, theta), projected
     assert found is not None
     cost, theta = found
     if opening is not None and not give_up and np.isfinite(cost):
-        effort = Effort(rows, 10, rounds, tolerance)
-        theta, cost, count, fitted = _finely(problem, model, outputs, theta, effort)
+        limits = Limits(rows, 10, rounds, tolerance)
+        theta, cost, count, fitted = _finely(problem, model, outputs, theta, limits)
         evaluations += count
     elif give_up and opening is not None:
         _, theta = Projected(problem, model, outputs, rows).evaluate(theta)
@@ -324,7 +324,7 @@ def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tupl
 
 
 @dataclass(frozen=True)
-class Effort:
+class Limits:
     """Limits a search: rows of each output, iterations and tolerance of each round, rounds of reduced weights."""
 
     rows: int
@@ -338,12 +338,12 @@ def _finely(
     model: Model,
     outputs: Sequence[str],
     theta: Array,
-    effort: Effort,
+    limits: Limits,
 ) -> tuple[Array, float, int, Projected]:
     """Return (theta, cost, evaluations, residuals) after a search on some rows and another with reduced weights of
     outliers and with the priors of the weights of effects.
     """
-    rows, iterations, rounds, tolerance = effort.rows, effort.iterations, effort.rounds, effort.tolerance
+    rows, iterations, rounds, tolerance = limits.rows, limits.iterations, limits.rounds, limits.tolerance
     before = 0
     if rows > 2 * SEARCH_ROWS:
         # the search begins on part of the rows and ends on all of them
