@@ -100,6 +100,10 @@ class UnixI2c:
             raise ProtocolError(f"{n} bytes in a reply of {REPLY.size + length}", device=self._path)
         if status:
             raise _error(status, address, self._path)
+        wanted = sum(op.n for op in ops if not isinstance(op, I2cWrite))
+        if length != wanted:
+            self._disconnect()  # it answers another request, and so would the next one
+            raise ProtocolError(f"{length} bytes were read where {wanted} were asked for", device=self._path)
         return self._reply[REPLY.size : n].tobytes()
 
     def _spoilt(self, error: OSError) -> HalError:

@@ -36,12 +36,13 @@ class I2cSocketServer:
         self._listener.listen(4)
         self._listener.setblocking(False)
         self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
-        self._queue: deque[tuple[int, int, int, Sequence[I2cOp]]] = deque()  # start, client, address, operations
-        self._active: tuple[int, Transfer] | None = None
+        # start, client, address, operations; a client is its socket, since the next one may have its descriptor
+        self._queue: deque[tuple[int, socket.socket, int, Sequence[I2cOp]]] = deque()
+        self._active: tuple[socket.socket, Transfer] | None = None
         self._due_ns = 0
         self._reply_ns = 0
         self._free_ns = 0
-        self._held: list[tuple[int, bytes]] | None = None
+        self._held: list[tuple[socket.socket, bytes]] | None = None
 
     @property
     def has_clients(self) -> bool:
@@ -68,7 +69,7 @@ class I2cSocketServer:
         try:
             while (request := _parse(buffer)) is not None:
                 asked_ns, address, ops = request
-                self._queue.append((min(max(asked_ns - behind_ns, reached_ns), now_ns), fileno, address, ops))
+                self._queue.append((min(max(asked_ns - behind_ns, reached_ns), now_ns), client, address, ops))
         except ValueError:
             data = b""
         if not data:
@@ -90,13 +91,13 @@ class I2cSocketServer:
             if self._active is None:
                 self._start(due_ns)
                 continue
-            fileno, transfer = self._active
+            client, transfer = self._active
             try:
                 self._due_ns = next(transfer)
             except StopIteration as done:
                 self._active = None
                 self._free_ns = due_ns
-                self._answer(fileno, done.value)
+                self._answer(client, done.value)
 
     def hold(self) -> None:
         """Keep answers back until ``release``: for who lets a transfer end a little before its time has come."""
@@ -105,8 +106,8 @@ class I2cSocketServer:
 
     def release(self) -> None:
         held, self._held = self._held, None
-        for fileno, answer in held or ():
-            self._say(fileno, answer)
+        for client, answer in held or ():
+            self._say(client, answer)
 
     def close(self) -> None:
         self._listener.close()
@@ -116,31 +117,32 @@ class I2cSocketServer:
         self.path.unlink(missing_ok=True)
 
     def _start(self, t_ns: int) -> None:
-        _, fileno, address, ops = self._queue.popleft()
+        _, client, address, ops = self._queue.popleft()
         transfer = self._line.transfer(address, ops, t_ns)
-        self._active = (fileno, transfer)
+        self._active = (client, transfer)
         self._due_ns = next(transfer)
         self._reply_ns = t_ns + self._line.duration_ns(ops)
 
-    def _answer(self, fileno: int, result: TransferResult) -> None:
+    def _answer(self, client: socket.socket, result: TransferResult) -> None:
         status, data = result
         answer = struct.pack("<BH", status, len(data)) + data
         if self._held is None:
-            self._say(fileno, answer)
+            self._say(client, answer)
         else:
-            self._held.append((fileno, answer))
+            self._held.append((client, answer))
 
-    def _say(self, fileno: int, answer: bytes) -> None:
-        if fileno in self._clients:
+    def _say(self, client: socket.socket, answer: bytes) -> None:
+        fileno = client.fileno()
+        if fileno in self._clients:  # -1 after it was dropped
             try:
-                self._clients[fileno][0].sendall(answer)
+                client.sendall(answer)
             except OSError:
                 self._drop(fileno)
 
     def _drop(self, fileno: int) -> None:
         client, _ = self._clients.pop(fileno)
         client.close()
-        self._queue = deque(item for item in self._queue if item[1] != fileno)
+        self._queue = deque(item for item in self._queue if item[1] is not client)
 
 
 def _parse(buffer: bytearray) -> tuple[int, int, Sequence[I2cOp]] | None:

@@ -30,6 +30,7 @@ from hal.errors import (
     HalError,
     HalTimeout,
     I2cNack,
+    ProtocolError,
 )
 from hal.types import I2cRead, I2cWrite
 from tests.contract.i2c_contract import MEMORY, REFUSING, I2cContract, RegisterDevice
@@ -108,6 +109,24 @@ def test_stuck_world_is_a_bounded_wait_and_is_connected_to_anew(tmp_path: Path):
         server.join()
         with pytest.raises(Closed):
             bus.transfer(MEMORY, [I2cRead(1)])
+
+
+def test_an_answer_of_another_length_is_no_answer_and_the_next_request_connects_anew(tmp_path: Path):
+    path = tmp_path / "shifted.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(4)
+        bus = UnixI2c(str(path), timeout_s=1.0)
+        shifted, _ = listener.accept()
+        shifted.sendall(bytes.fromhex("00 0000"))  # what somebody else's write was answered
+        with pytest.raises(ProtocolError, match="0 bytes were read where 1 were asked for"):
+            bus.transfer(MEMORY, [I2cWrite(b"\x00"), I2cRead(1)])
+        shifted.close()
+        server = threading.Thread(target=serve, args=(listener, RegisterDevice()))
+        server.start()
+        assert len(bus.transfer(MEMORY, [I2cWrite(b"\x00"), I2cRead(1)])) == 1
+        bus.close()
+        server.join()
 
 
 def test_a_world_that_has_gone_stays_a_disconnect(tmp_path: Path):

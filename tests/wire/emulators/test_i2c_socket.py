@@ -65,6 +65,23 @@ def test_an_answer_that_is_held_is_said_when_it_is_released(stand: Stand) -> Non
     assert stand.client.recv(10) == bytes.fromhex("00 0000")
 
 
+def test_an_answer_does_not_go_to_the_next_client_that_has_the_same_descriptor(stand: Stand) -> None:
+    """The firmware dies in the middle of a transfer and its guardian connects: each has its own answers."""
+    stand.ask("0c 01 00 0300 31 4000")
+    stand.deliver(1000)
+    stand.client.close()
+    descriptor = stand.server.filenos()[1]
+    stand.deliver(2000)
+    other = stand.connect()
+    assert stand.server.filenos() == [stand.server.filenos()[0], descriptor]
+    stand.ask("0c 02 00 0100 01 01 0200", client=other)
+    stand.deliver(3000)
+    stand.server.advance_to(10_000_000)
+    assert other.recv(64) == bytes.fromhex("00 0200 4000")
+    assert stand.dac.output_V[0] == 1.25
+    other.close()
+
+
 def test_write_answers_after_its_bus_time(stand: Stand) -> None:
     stand.ask("0c 01 00 0300 31 4000")
     stand.deliver(1000)
