@@ -17,7 +17,7 @@ from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
 from tools.mismatch.plan.limits import Wish, parse_band, settle_limits
-from tools.mismatch.plan.models import Rival, distance, log_ratio
+from tools.mismatch.plan.models import Rival, distance, evidence, separation
 from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect
 from tools.mismatch.plan.separable import separable
 from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, situation, with_outputs
@@ -126,10 +126,30 @@ def test_distance_is_the_expected_log_likelihood_ratio(recorded: Path):
     assert d > 3.0
     truth = _outputs(course, lag)
     ratios = [
-        log_ratio(with_outputs(course, noisy(truth, SIGMA, np.random.default_rng(k))), lag, delay, SIGMA)
+        evidence(with_outputs(course, noisy(truth, SIGMA, np.random.default_rng(k))), lag, delay, SIGMA)[0]
         for k in range(12)
     ]
     assert abs(np.mean(ratios) - d**2 / 2) < 3 * d / np.sqrt(len(ratios)) + 1.0
+
+
+def test_parameters_without_influence_are_no_evidence(recorded: Path):
+    """At rest neither model moves: a rival with a parameter more or less is neither favoured nor rejected."""
+    where = situation(recorded)
+    lag, _ = lag_and_delay(where)
+    plain = Rival("none", (), lag.theta[:2])
+    course = where.course({"command": np.full(N, 50.0)})
+    measured = with_outputs(course, noisy(_outputs(course, lag), SIGMA, np.random.default_rng(3)))
+    for a, b in ((lag, plain), (plain, lag)):
+        assert max(np.abs(evidence(measured, a, b, SIGMA))) < 1.0
+
+
+def test_a_floor_ends_a_comparison_early_and_changes_nothing_above_it(recorded: Path):
+    where = situation(recorded)
+    pair = lag_and_delay(where)
+    course = where.course({"command": 50 + 2.0 * np.sin(2 * np.pi * 8 * np.arange(N) / RATE_HZ)})
+    whole = separation(course, pair, SIGMA, thorough=True)
+    assert separation(course, pair, SIGMA, floor=0.5 * whole, thorough=True) == pytest.approx(whole, rel=1e-3)
+    assert separation(course, pair, SIGMA, floor=2.0 * whole, thorough=True) <= 2.0 * whole
 
 
 def test_a_model_that_begins_at_rest_is_at_no_distance_from_itself_on_an_input_that_repeats(tmp_path: Path):

@@ -6,8 +6,9 @@ family on a reduced budget, then a (1 + 1) evolution strategy with the one-fifth
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,11 +64,12 @@ def design(
     *,
     evaluations: int = 80,
     seed: int = 0,
+    compared: int = COMPARED,
     progress: Progress | None = None,
 ) -> Plan:
     """Design the inputs named in ``limits`` together (each is a waveform of the same family).
 
-    ``evaluations``: inputs that are tried. Same arguments: same plan.
+    ``evaluations``: inputs that are tried; ``compared``: random multisines beside the plan. Same arguments: same plan.
     """
     rng = np.random.default_rng(seed)
     done = 0
@@ -84,19 +86,18 @@ def design(
             progress("inputs", done, evaluations)
         return separation(where.course(waves(family, z)), rivals, sigma, QUICK, floor, thorough=True)
 
+    named = [(name, family, np.tile(z, len(signals))) for name, (family, z) in LIBRARY.items()]
+    drawn = [("", f, rng.random(SIZE[f] * len(signals))) for f in FAMILIES for _ in range(RANDOM_PER_FAMILY)]
     points: list[_Point] = []
-    for name, (family, z) in LIBRARY.items():
-        whole = np.concatenate([np.asarray(z) for _ in signals])
-        points.append(_Point(family, whole, value(family, whole), name))
-    for family in FAMILIES:
-        for _ in range(RANDOM_PER_FAMILY):
-            z = rng.random(SIZE[family] * len(signals))
-            points.append(_Point(family, z, value(family, z)))
-    points.sort(key=lambda p: -p.value)
+    for name, family, z in (*named, *drawn):
+        # the value of a point that cannot be a finalist is a bound
+        floor = points[FINALISTS - 1].value if len(points) >= FINALISTS else -1.0
+        points.append(_Point(family, z, value(family, z, floor), name))
+        points.sort(key=lambda p: -p.value)
     ends = points[:FINALISTS]
     share = max(0, evaluations - done) // REFINED
-    for start in _unlike(points, REFINED):
-        now, step = start, 0.2
+    for start in _unlike(points, REFINED) if share else ():
+        now, step = replace(start, value=value(start.family, start.z)), 0.2
         for _ in range(share):
             z = now.z + step * rng.standard_normal(now.z.size)
             z = np.abs(z) % 2.0
@@ -108,16 +109,21 @@ def design(
                 step = max(step * 1.5**-0.25, 0.01)
         ends.append(now)
     # an incomplete search overestimates an input, so the finalists are followed to convergence
-    judged = [(pair_distances(where, rivals, waves(p.family, p.z), sigma), p) for p in ends]
-    pairs, best = max(judged, key=lambda found: min(found[0].values()))
+    top, best = -1.0, ends[0]
+    for p in ends:
+        course = where.course(waves(p.family, p.z))
+        found = separation(course, rivals, sigma, FULL, top, thorough=True)
+        if found > top:
+            top, best = found, p
     chosen = waves(best.family, best.z)
+    pairs = pair_distances(where, rivals, chosen, sigma)
     return Plan(
         chosen,
         dict(limits),
         where.dt,
         best.name or best.family,
         min(pairs.values()),
-        random_separation(where, rivals, chosen, limits, sigma, seed),
+        random_separation(where, rivals, chosen, limits, sigma, seed, compared),
         pairs,
         done,
     )
@@ -158,11 +164,12 @@ def random_separation(
     limits: Mapping[str, Limits],
     sigma: Mapping[str, float],
     seed: int,
+    compared: int = COMPARED,
 ) -> float:
-    """Return the median separation on random multisines of equal energy."""
+    """Return the median separation on ``compared`` random multisines of equal energy; NaN without one."""
     rng = np.random.default_rng([seed, ENERGIES_SEED])
     found = [
         separation(where.course(random_inputs(waves, limits, where.dt, rng)), rivals, sigma, FULL, thorough=True)
-        for _ in range(COMPARED)
+        for _ in range(compared)
     ]
-    return float(np.median(found))
+    return float(np.median(found)) if found else math.nan

@@ -93,14 +93,20 @@ def separation(
     course: Recording, rivals: Sequence[Rival], sigma: Mapping[str, float], iterations: int = 8, floor: float = -1.0,
     *, thorough: bool = False,
 ) -> float:  # fmt: skip
-    """Return the least separation of any two rivals (``joint``). Ends early once a pair is not above ``floor``."""
+    """Return the least separation of any two rivals (``joint``). Ends early once a pair is not above ``floor``.
+
+    Every re-fit bounds a distance from above, so a thorough one is made only where a quick one lies above ``floor``.
+    """
     least = math.inf
     for i, a in enumerate(rivals):
         for b in rivals[i + 1 :]:
-            ways = ((a, b), (b, a))
-            least = min(least, joint(*(distance(course, x, y, sigma, iterations, thorough=thorough) for x, y in ways)))
-            if least <= floor:
-                return least
+            bounds = [math.inf, math.inf]
+            for careful in (False, True) if thorough and floor > 0.0 else (thorough,):
+                for k, (x, y) in enumerate(((a, b), (b, a))):
+                    bounds[k] = min(bounds[k], distance(course, x, y, sigma, iterations, thorough=careful))
+                    if (found := joint(*bounds)) <= floor:
+                        return found
+            least = min(least, joint(*bounds))
     return least
 
 
@@ -113,16 +119,17 @@ def joint(forward: float, back: float) -> float:
     return math.sqrt(math.sqrt((1.0 + forward**2) * (1.0 + back**2)) - 1.0)
 
 
-def log_ratio(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, float]) -> float:
-    """Return the log likelihood of ``a`` less that of ``b`` on a recording, both re-fitted (normal noise of known rms).
+def evidence(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, float]) -> tuple[float, float]:
+    """Return the evidence of a waveform for ``a`` over ``b``, and for ``b`` over ``a``, both re-fitted.
 
-    Each parameter costs half the logarithm of the number of samples (Schwarz 1978), so that a model that contains the
-    other has no advantage by its freedom alone.
+    It is the difference of log likelihoods (normal noise of known rms). A price of parameters is not in it, because it
+    would favour the smaller model on an input that moves neither. Where the favoured model has more parameters than the
+    other, half of each is taken off: what they are expected to gain from noise alone.
     """
     found = [refit(recording, r, sigma, iterations=25, thorough=True) for r in (a, b)]
-    left = [squares(f, sigma) for f in found]
-    price = 0.5 * math.log(recording.n * len(recording.outputs))
-    return 0.5 * (left[1] - left[0]) + price * (found[1].theta.size - found[0].theta.size)
+    gain = 0.5 * (squares(found[1], sigma) - squares(found[0], sigma))
+    spare = found[0].theta.size - found[1].theta.size
+    return gain - 0.5 * max(0, spare), -gain - 0.5 * max(0, -spare)
 
 
 def best_rival(
