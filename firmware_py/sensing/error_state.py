@@ -11,8 +11,9 @@ does not travel, so v = 0 with a noise density. Accelerations of the hand thereb
 attitude, where a direct comparison of f with gravity would follow each of them. The velocity of a tremor is far larger
 than that noise but in a known band: a notch takes it out of the comparison, which lets gravity be trusted much more.
 
-The magnetic field turns the heading only; its disturbance has a state of its own with time constant T. A field
-whose size or dip is off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
+The magnetic field turns the heading only; its disturbance has a state of its own with time constant T. A magnet that
+moves with the body is found and taken off the field (gyroscope only, ``magnet.py``). A field whose size or dip is then
+off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
 Accelerometers without a field to believe: the last one stays where it was in the body, which holds the heading on
 average and keeps the rate about the vertical bounded.
 Sequential scalar updates in Joseph form, each gated at ``gate`` standard deviations where that is said.
@@ -38,6 +39,7 @@ from firmware_py.sensing.error_state_records import (
     ErrorStateNumbers,
     ErrorStateParams,
 )
+from firmware_py.sensing.magnet import begin_magnet, find_magnet, heading_spread
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
 from hal.scratch import scratch
@@ -85,6 +87,7 @@ def begin_errors(field: Array, state: ErrorStateAttitude, params: ErrorStateNumb
     e.moving_s = 0.0
     e.gated = 0
     e.regained_s = FIELD_REGAIN_S
+    begin_magnet(e.magnet)
 
 
 @kernel
@@ -204,6 +207,7 @@ def apply_correction(state: ErrorStateAttitude, x: Array) -> None:
         state.bias[i] += x[BIAS + i]
         e.velocity[i] += x[VELOCITY + i]
     e.disturbance += x[DISTURBANCE]
+    e.magnet.corrected_rad += x[TURN + 2]
     for i in range(ERRORS):
         x[i] = 0.0
 
@@ -256,7 +260,7 @@ def error_state_step(motion: Motion, state: ErrorStateAttitude, param: ErrorStat
     e.field_fresh_s += dt
     e.field_wait_s += dt
     if motion.fresh:
-        _heading(state, params, state.field, x)
+        _heading(state, params, x)
         e.field_fresh_s = 0.0
     if params.held_density > 0.0 and e.field_wait_s > HELD_AFTER_S:
         b = e.trusted
@@ -283,10 +287,17 @@ def _forget_velocity(e: ErrorState) -> None:
 
 
 @kernel
-def _heading(state: ErrorStateAttitude, params: ErrorStateParams, field: Array, x: Array) -> None:
-    """Correct the heading with a field that looks like the learned one."""
+def _heading(state: ErrorStateAttitude, params: ErrorStateParams, x: Array) -> None:
+    """Correct the heading with a field that looks like the learned one, once a magnet on the body is taken off it."""
     e = state.error_state
     c = state.matrix
+    field = scratch(3)
+    for i in range(3):
+        field[i] = state.field[i]
+    if params.magnet.room_density > 0.0:
+        find_magnet(e.magnet, params.magnet, c, state.field, e.field_fresh_s)
+        for i in range(3):
+            field[i] -= e.magnet.share * e.magnet.unit * e.magnet.pair[3 + i]
     north = c[0, 0] * field[0] + c[0, 1] * field[1] + c[0, 2] * field[2]
     west = c[1, 0] * field[0] + c[1, 1] * field[1] + c[1, 2] * field[2]
     up = c[2, 0] * field[0] + c[2, 1] * field[1] + c[2, 2] * field[2]
@@ -315,7 +326,10 @@ def _heading(state: ErrorStateAttitude, params: ErrorStateParams, field: Array, 
         for i in range(3):
             e.trusted[i] = field[i]
         residual = e.disturbance - atan2(west, north)
-        correct(Measurement(TURN + 2, DISTURBANCE, residual, params.heading_density / since, 1e9), e, x)
+        density = params.heading_density
+        if params.magnet.room_density > 0.0:
+            density += heading_spread(e.magnet, params.magnet, c) * (e.magnet.unit / level) ** 2
+        correct(Measurement(TURN + 2, DISTURBANCE, residual, density / since, 1e9), e, x)
         return
     e.rejected += 1
     # a field that has been steady elsewhere for long is the new environment

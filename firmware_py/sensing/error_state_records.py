@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from firmware_py.records import Array, field, record
 from firmware_py.sensing.attitude_filter import AttitudeParams, AttitudeState
+from firmware_py.sensing.magnet import Magnet, MagnetParams
 
 ERRORS = 13
 TURN, RATE, BIAS, VELOCITY, DISTURBANCE = 0, 3, 6, 9, 12
@@ -41,6 +42,7 @@ class ErrorStateParams:
     rest_force_m_s2: float = field("m/s^2")
     rest_s: float = field("s")
     gravity: float = field("m/s^2")
+    magnet: MagnetParams = field("")
 
 
 @record
@@ -67,6 +69,7 @@ class ErrorState:
     slow_force: Array = field("m/s^2", 3)
     still_s: float = field("s")
     rejected: int = field("1")  # magnetic fields that were not used
+    magnet: Magnet = field("")
 
 
 @record

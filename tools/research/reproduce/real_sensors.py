@@ -301,4 +301,6 @@ def table() -> Table:
     notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in existing]
     if "broad" in existing and find_spec("vqf") is None:
         notes.append("the vqf package (development extra) is not installed: its rows are left out")
+    if broad.NOT_GIVEN in existing:
+        notes += broad.NOTES
     return build("real-sensors", list(existing.values()), notes)
