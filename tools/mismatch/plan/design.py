@@ -123,7 +123,7 @@ def design(
         where.dt,
         best.name or best.family,
         min(pairs.values()),
-        random_separation(where, rivals, chosen, limits, sigma, seed, compared),
+        random_separation(where, rivals, chosen, limits, sigma, seed=seed, compared=compared),
         pairs,
         done,
     )
@@ -163,6 +163,7 @@ def random_separation(
     waves: Mapping[str, Array],
     limits: Mapping[str, Limits],
     sigma: Mapping[str, float],
+    *,
     seed: int,
     compared: int = COMPARED,
 ) -> float:
