@@ -43,3 +43,13 @@ def machine() -> dict[str, object]:
         "python": platform.python_version(),
         "load_before": round(os.getloadavg()[0], 2),
     }
+
+
+def stolen_ms() -> float:
+    """Return the time in ms, since the start of the machine, for which its host let no processor of it run that had
+    work: the column "steal" of /proc/stat; 0 where there is none."""
+    try:
+        line = Path("/proc/stat").read_text().splitlines()[0].split()
+    except OSError:
+        return 0.0
+    return 1e3 * int(line[8]) / os.sysconf("SC_CLK_TCK")

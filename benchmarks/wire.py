@@ -1,48 +1,38 @@
-"""(l) ``micron run --realtime``, compiled and in Python, beside the bare echo on the same carriers, in one run.
+"""(l) ``micron run --realtime``, compiled and in Python, beside a bare loop on the same wires, in one run.
 
 Serial bench: scans come and commands go over a pty each. Default bench: scans over a pty, commands over the socket of
-the emulated I2C bus, whose own time is taken off. A bare echo does the same with nothing in between.
+the emulated I2C bus, whose own time is taken off. The bare loop (``benchmarks.bare``) answers scans of the same
+emulated world with nothing in between.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import pty
 import re
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.bare import Bare
+from benchmarks.machine import stolen_ms
 from benchmarks.row import Row
 from drivers.piezo.dac_amplifier import WIRE_BITS
 from firmware_py.app import run_in_process
-from firmware_py.run_request import LOOP_PRIORITY, WORKER_PRIORITY, RunRequest
-from firmware_py.scheduler.realtime import RealtimeConfig, realtime
-from hal.backends.unix_i2c import HEAD, REPLY, SEGMENT
+from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
 from tools.cli.bench_option import bench_path
 
-ECHOES = 2500
-"""Answers of an echo at a time; it is measured before and after the runs."""
-PACKET = 16
 I2C_HZ = 400_000
 BUS_NS = round(WIRE_BITS["command"] * 1e9 / I2C_HZ)
-SEGMENTS = SEGMENT.pack(0, 3) + bytes(3)
 COMPILED, PYTHON, SPINNING = "compiled", "Python", "compiled beside a thread that spins"
-OF_PEER = RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0)
-SETTINGS = RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0, worker_priority=WORKER_PRIORITY)
-"""Settings of the echo and of what asks it, together those of the firmware: the echo is killed, and what it had
-changed of the kernel would stay."""
 GOALS = (("p50", 50.0, 1.5), ("p99", 99.0, 1.5), ("p99.9", 99.9, 2.0))
 BESIDE_GOAL = 1.1
 CORE_GOAL = 0.15
@@ -70,17 +60,19 @@ class Setup(NamedTuple):
 
 
 SETUPS = (
-    Setup("serial", "micron-e727.toml", 1000, (COMPILED, PYTHON, SPINNING), 10.0, 0),
-    Setup("I2C", "micron.toml", 1000, (COMPILED, PYTHON, SPINNING), 6.0, BUS_NS),
+    Setup("serial", "micron-e727.toml", 1000, (COMPILED, PYTHON, SPINNING), 12.0, 0),
+    Setup("I2C", "micron.toml", 1000, (COMPILED, PYTHON, SPINNING), 8.0, BUS_NS),
     Setup("serial at 4 kHz", "micron-e727.toml", FAST_HZ, (COMPILED, PYTHON), 5.0, 0),
 )
 
 
 class Run(NamedTuple):
-    """Holds the firmware's own figures of a run, and the ``core`` share of its process since the bench was open."""
+    """Holds the firmware's own figures of a run, the ``core`` share of its process since the bench was open, and the
+    time in ms that the host took from the machine."""
 
     outcome: dict[str, Any]
     core: float
+    stolen_ms: float
 
     def latency_us(self, name: str) -> float:
         return self.outcome["latency"]["sample_to_command_us"][name.replace(".", "_")]
@@ -99,92 +91,30 @@ class Run(NamedTuple):
         compiled, ticks = self.outcome.get("loop", {}).get("ticks", 0), self.outcome["ticks"]["run"]
         held, safe = len(self.outcome["holds"]), self.outcome["safe_state"]
         ended = "" if safe["normal"] else f"; ended early: {safe['reason']}"
-        return f"{self.outcome['commands']['sent']} commands, {compiled} of {ticks} ticks compiled, {held} holds{ended}"
+        sent = self.outcome["commands"]["sent"]
+        return f"{sent} commands, {compiled} of {ticks} ticks compiled, {held} holds, {self.host}{ended}"
+
+    @property
+    def host(self) -> str:
+        """What the host did meanwhile: the processors' "steal" of /proc/stat, and the world's own pauses."""
+        stalls, longest_ms = self.outcome["host"]["stalls"], self.outcome["host"]["longest_stall_ms"]
+        return f"host took {self.stolen_ms:g} ms, {stalls} pauses of the world (longest {longest_ms:.1f} ms)"
 
 
-# -- the bare echo -----------------------------------------------------------------------------------------
+# -- the bare loop -----------------------------------------------------------------------------------------
 
 
-def echo(path: str) -> None:
-    """Be the far end of a pty: send every packet back."""
-    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    with realtime(OF_PEER):
-        print("ready", flush=True)
-        while True:
-            os.write(fd, os.read(fd, PACKET))
-
-
-def echo_to_bus(path: str, bus: str, n: int) -> None:
-    """Be the far end of a pty: make a transfer on ``bus`` for every packet, and print when each was acknowledged."""
-    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    connection.connect(bus)
-    acknowledged_ns: list[int] = []
-    with realtime(OF_PEER):
-        print("ready", flush=True)
-        for _ in range(n):
-            os.read(fd, PACKET)
-            connection.sendall(HEAD.pack(0x0C, 1, time.monotonic_ns()) + SEGMENTS)
-            connection.recv(REPLY.size)
-            acknowledged_ns.append(time.monotonic_ns())
-    print(json.dumps(acknowledged_ns), flush=True)
-
-
-def measure_echo(setup: Setup) -> np.ndarray:
-    """Return the time in us from a packet to its answer, for packets at the rate of ``setup``: to the answer's arrival
-    on the pty or, less the bus, to the acknowledgement of a transfer."""
-    n = ECHOES * setup.tick_hz // 1000
-    master, slave = pty.openpty()
-    for fd in (master, slave):
-        tty.setraw(fd)
-    with tempfile.TemporaryDirectory(prefix="micron-") as folder, socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(f"{folder}/bus.sock")
-        listener.listen(1)
-        more = (
-            ["to-bus", os.ttyname(slave), f"{folder}/bus.sock", str(n)] if setup.bus_ns else ["echo", os.ttyname(slave)]
-        )
-        command = [sys.executable, "-m", "benchmarks.wire", *more]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
-            try:
-                assert peer.stdout is not None
-                if peer.stdout.readline() != "ready\n":
-                    raise RuntimeError("the echo did not start")
-                bus = listener.accept()[0] if setup.bus_ns else None
-                sent_ns, answered_ns = _ask(master, bus, n, round(setup.period_us * 1e3), setup.bus_ns)
-                if bus is not None:
-                    answered_ns = json.loads(peer.stdout.readline())
-                    bus.close()
-            finally:
-                peer.kill()
-    os.close(master)
-    os.close(slave)
-    return (np.array(answered_ns) - np.array(sent_ns) - setup.bus_ns) * 1e-3
-
-
-def _ask(fd: int, bus: socket.socket | None, n: int, period_ns: int, bus_ns: int) -> tuple[list[int], list[int]]:
-    """Send ``n`` packets and wait for the answer to each. Return when each was sent and answered, ns. A packet that was
-    due before the answer to the one before it is sent then."""
-    sent_ns: list[int] = []
-    answered_ns: list[int] = []
-    with realtime(SETTINGS):
-        due_ns = time.monotonic_ns() + 100_000_000
-        for _ in range(n):
-            due_ns += period_ns
-            time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
-            sent_ns.append(time.monotonic_ns())
-            os.write(fd, bytes(PACKET))
-            if bus is None:
-                got = 0
-                while got < PACKET:
-                    got += len(os.read(fd, PACKET - got))
-            else:
-                request = bus.recv(HEAD.size + len(SEGMENTS), socket.MSG_WAITALL)
-                end_ns = HEAD.unpack_from(request)[2] + bus_ns
-                while time.monotonic_ns() < end_ns:  # as the emulated world waits for the end of a transfer
-                    pass
-                bus.sendall(REPLY.pack(0, 0))
-            answered_ns.append(time.monotonic_ns())
-    return sent_ns, answered_ns
+def measure_bare(setup: Setup, *, polls: bool = False) -> Bare:
+    """Run the bare loop of ``benchmarks.bare`` on the bench of ``setup``, in a process of its own. The emulated bus is
+    taken off."""
+    with tempfile.TemporaryDirectory(prefix="micron-") as folder:
+        file = bench_file(setup, Path(folder))
+        command = [sys.executable, "-m", "benchmarks.bare", str(file), f"{setup.run_s:g}", f"{setup.tick_hz}"]
+        done = subprocess.run([*command, *["polls"] * polls], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"bare loop, {setup.name}: {(done.stderr.strip().splitlines() or ['no reason'])[-1]}")
+    bare = Bare(*json.loads(done.stdout))
+    return bare._replace(late_us=[late_us - setup.bus_ns * 1e-3 for late_us in bare.late_us])
 
 
 # -- the firmware ------------------------------------------------------------------------------------------
@@ -211,7 +141,7 @@ def _spin() -> None:
 
 def run_all(setup: Setup) -> None:
     """Be the firmware of each kind of run, one after another, and print their ``Run`` as JSON."""
-    found: list[tuple[dict[str, Any], float]] = []
+    found: list[tuple[dict[str, Any], float, float]] = []
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         bench = bench_file(setup, Path(folder))
         for compiled in (True, False):  # everything is compiled or loaded
@@ -222,13 +152,13 @@ def run_all(setup: Setup) -> None:
             began: list[float] = []
 
             def on_open(opened: OpenBench, began: list[float] = began) -> None:
-                began[:] = time.process_time(), time.thread_time(), time.monotonic()
+                began[:] = time.process_time(), time.monotonic(), stolen_ms()
 
             request = RunRequest(bench, setup.run_s, pace="realtime", compiled=kind != PYTHON)
             outcome, _ = run_in_process(request, on_open=on_open)
-            core = (time.process_time() - began[0]) / (time.monotonic() - began[2])
-            kept = ("latency", "ticks", "loop", "safe_state", "holds", "commands")
-            found.append(({key: outcome[key] for key in kept if key in outcome}, core))
+            core = (time.process_time() - began[0]) / (time.monotonic() - began[1])
+            kept = ("latency", "ticks", "loop", "safe_state", "holds", "commands", "host")
+            found.append(({key: outcome[key] for key in kept if key in outcome}, core, stolen_ms() - began[2]))
     print(json.dumps(found, default=str), flush=True)
     os._exit(0)
 
@@ -248,36 +178,53 @@ def measure_runs(setup: Setup) -> dict[str, Run]:
 
 def rows() -> Iterator[Row]:
     for setup in SETUPS:
-        before = measure_echo(setup)
+        before = measure_bare(setup)
         runs = measure_runs(setup)
-        bare = np.concatenate([before, measure_echo(setup)])
+        after = measure_bare(setup)
+        bare = Bare(
+            before.late_us + after.late_us, (before.without_command + after.without_command) / 2,
+            before.stolen_ms + after.stolen_ms,
+        )  # fmt: skip
         for kind, run in runs.items():
             if setup.tick_hz == 1000:
                 yield from latency_rows(setup, kind, run, bare)
             yield missed_row(setup, kind, run, bare)
+        if setup.bus_ns:
+            yield from polled_rows(setup, measure_bare(setup, polls=True), bare)
         if SPINNING in runs:
             yield from beside_rows(setup, runs)
         yield from core_rows(setup, runs)
 
 
-def latency_rows(setup: Setup, kind: str, run: Run, bare: np.ndarray) -> Iterator[Row]:
-    for name, share, factor in GOALS:
-        ours, peer = run.latency_us(name) - setup.bus_ns * 1e-3, float(np.percentile(bare, share))
-        must = kind == COMPILED
+def polled_rows(setup: Setup, polled: Bare, bare: Bare) -> Iterator[Row]:
+    """What the emulated world, one process in Python, is late for because it serves the slow converters, too."""
+    for name, share, _ in GOALS:
+        ours, peer = (float(np.percentile(each.late_us, share)) for each in (polled, bare))
         yield Row(
-            f"sample to command, {setup.name}, {kind}, {name}", run.what, ours, peer, "bare echo, same carrier", "us",
-            ours / peer, f"<= {factor:g} x" if must else "-", ours <= factor * peer if must else None, must=must,
-            why=run.what if must else "",
+            f"sample to command, {setup.name}, bare loop beside the slow converters, {name}",
+            f"a Python thread polls them; host took {polled.stolen_ms:g} ms", ours, peer, "bare loop, same wires", "us",
+            ours / peer,
         )  # fmt: skip
 
 
-def missed_row(setup: Setup, kind: str, run: Run, bare: np.ndarray) -> Row:
-    late = 100.0 * max(float(np.mean(bare >= setup.period_us)), 1.0 / len(bare))
+def latency_rows(setup: Setup, kind: str, run: Run, bare: Bare) -> Iterator[Row]:
+    for name, share, factor in GOALS:
+        ours, peer = run.latency_us(name) - setup.bus_ns * 1e-3, float(np.percentile(bare.late_us, share))
+        must = kind == COMPILED
+        yield Row(
+            f"sample to command, {setup.name}, {kind}, {name}", run.what, ours, peer, "bare loop, same wires", "us",
+            ours / peer, f"<= {factor:g} x" if must else "-", ours <= factor * peer if must else None, must=must,
+            why=f"{run.host}; beside the bare loop {bare.stolen_ms:g} ms" if must else "",
+        )  # fmt: skip
+
+
+def missed_row(setup: Setup, kind: str, run: Run, bare: Bare) -> Row:
+    late = max(bare.without_command, 100.0 / (2.0 * setup.run_s * setup.tick_hz))  # one scan at least
     factor = 2.0 if setup.tick_hz == 1000 else 1.0
     must = kind == COMPILED
     return Row(
         f"ticks without a command, {setup.name}, {kind}", f"skipped or caught up with in a later tick; {run.what}",
-        run.without_command, late, "echoes later than a period", "%", run.without_command / late,
+        run.without_command, late, "the same of the bare loop", "%", run.without_command / late,
         f"<= {factor:g} x" if must else "-", run.without_command <= factor * late if must else None, must=must,
         why="ticks of self-test and holds are Python's" if must else "",
     )  # fmt: skip
@@ -304,8 +251,6 @@ def core_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
 
 
 ROLES: dict[str, Callable[[Sequence[str]], None]] = {
-    "echo": lambda words: echo(words[0]),
-    "to-bus": lambda words: echo_to_bus(words[0], words[1], int(words[2])),
     "run": lambda words: run_all(SETUPS[int(words[0])]),
 }
 

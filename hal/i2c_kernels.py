@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from hal.backends.unix_i2c import HEAD, REPLY, SEGMENT
 from hal.compiled import kernel
-from hal.fd_kernels import EINTR, last_errno, now_ns, read_fd, write_fd
+from hal.fd_kernels import EINTR, POLLIN, last_errno, now_ns, poll_word, read_fd, wait_fds, write_fd
 from hal.i2c_carrier import LINUX, PYTHON
 from hal.python_call import call_python
 from hal.scratch import stack_index
@@ -36,6 +36,9 @@ I2C_RDWR, I2C_M_RD = 0x0707, 0x0001
 TIME_AT = 2
 """Place of the time in the head of a request."""
 REPLY_SIZE = REPLY.size
+POLLED_NS = 10_000_000
+"""Time for which an answer on a socket is waited for with ppoll, which sleeps on when the other end takes the request;
+a blocking read, which waits after that, is woken by it and sleeps again."""
 NO_ANSWER, GONE = -errno.EAGAIN, -errno.ECONNRESET
 
 _ioctl = types.ExternalFunction("ioctl", types.int32(types.int32, types.uintp, types.uintp))
@@ -131,6 +134,9 @@ def _transfer_socket(t: Transfer, fd: int) -> int:
     done = write_fd(fd, request, len(request), 0)
     if done < len(request):
         return done if done < 0 else NO_ANSWER
+    polls = stack_index(1)  # pyright: ignore[reportCallIssue]
+    polls[0] = poll_word(fd, POLLIN)
+    wait_fds(polls, at_ns + POLLED_NS)
     have, wanted = 0, REPLY_SIZE
     while have < wanted:
         n = read_fd(fd, reply, have, wanted)

@@ -54,6 +54,8 @@ connected."""
 LONGEST_LINGER_NS = 60_000_000_000
 """A client that does not go away keeps the world for so long at most."""
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
+SOON_NS = 100_000
+"""Longest time that taking a request or ending a transfer keeps the process from what is due next."""
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
 LONGEST_STEP_S = 60.0
@@ -195,6 +197,7 @@ class WorldProcess:
             ready = self._wait()
             for fileno in ready:
                 self._take_transfer(fileno)
+            self._speak_first()
             self._turn()  # events that were due before the request happen before it
             for fileno in ready:
                 self._on_readable(fileno)
@@ -235,6 +238,15 @@ class WorldProcess:
         if early_ns:
             self._be_there_at(deadline_ns)
         return []
+
+    def _speak_first(self) -> None:
+        """Be there for what a device will say on a serial line at once, before the world catches up with the present:
+        a scan is not late because a slow device was asked for something just before."""
+        if not self.count_down_ns or self._clock.is_paused:
+            return
+        said_ns = [due_ns for face, speaks in self._devices if speaks and (due_ns := face.next_event_ns()) is not None]
+        if said_ns and min(said_ns) < self._clock.now_ns() + SOON_NS:
+            self._be_there_at(min(said_ns))
 
     def _be_there_at(self, deadline_ns: int) -> None:
         """Compute the events of ``deadline_ns`` in advance, wait for that time, then only send their results.

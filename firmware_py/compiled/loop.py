@@ -47,6 +47,8 @@ BEAT_LIMIT_MS = 100.0
 AFTER_TICK_NS = 300_000
 """The pass of the Python thread comes so long after its tick was due: the compiled thread is done with it then."""
 LONGEST_PAUSE_NS = 10_000_000
+PASS_NS = 2_000_000
+"""Shortest time between two passes: what is due in it runs in one, since a pass costs more than most tasks of it."""
 SYNC_NS = 10_000_000
 """Time between two looks at what the thread has counted: the period of supervision and page."""
 SWITCH_S = 0.0005
@@ -93,6 +95,7 @@ class CompiledMicron(Micron):
 
         self._thread = thread
         self._daq, self._output = devices.daq, output
+        self._pass_ticks = max(1, PASS_NS // run.period_ns)
         self._is_virtual = isinstance(self.run.clock, VirtualClock)
         self.entries = self.ticks_compiled = 0
         self._done: tuple[int, int, int] | None = None
@@ -362,6 +365,7 @@ class CompiledMicron(Micron):
                         self._call_back()
             words = self._words
             next_k = self.run.scheduler.next_beside(last_k, at.STAGES)
+            next_k += -next_k % self._pass_ticks
             due_ns = int(words[at.LAST_DUE_NS]) + (next_k - int(words[at.LAST_K])) * self.run.period_ns + AFTER_TICK_NS
             now_ns = self.run.clock.now_ns()
             self.run.clock.sleep_until_ns(min(max(due_ns, now_ns + AFTER_TICK_NS), now_ns + LONGEST_PAUSE_NS))

@@ -94,7 +94,7 @@ from firmware_py.compiled.memory import (
     Words,
 )
 from firmware_py.compiled.outputs import is_stuck, step_ramp, verify, write
-from firmware_py.control.chain import COMMANDED, step_kernel
+from firmware_py.control.chain import COMMANDED, learn_after_step, step_kernel
 from firmware_py.control.fresh_field import fill_field
 from firmware_py.control.plausibility import CheckState, check_frame, check_scan
 from firmware_py.frame import CLIP, CLIP_YIELD, COMMAND, COUNTS, DRIFT, INVALID, JERK, STALE, STATUS, TICK, TIME
@@ -287,14 +287,18 @@ def run_block(m: Memory) -> int:
             return hand_over(words, row, ACTUATE, 0)
         actuated_ns = clock_ns(words)
         publish(m, frame)
-        published_ns = ended_ns = clock_ns(words)
+        published_ns = learned_ns = clock_ns(words)
+        if newest:  # for the others the step of the next row does it
+            learn_after_step(m.step)
+            learned_ns = clock_ns(words)
+        ended_ns = learned_ns
         if newest and is_verify_due(m, k, due_ns):
             if not verify(m.output, words[OUTPUT_FD]):
                 return hand_over(words, row, VERIFY, 0)
             ended_ns = clock_ns(words)
-            count_task(timing, VERIFY, published_ns, ended_ns, due_ns, k)
+            count_task(timing, VERIFY, learned_ns, ended_ns, due_ns, k)
         count_task(timing, SENSE, began_ns, sensed_ns, due_ns, k)
-        count_task(timing, ESTIMATE, sensed_ns, estimated_ns, due_ns, k)
+        count_task(timing, ESTIMATE, sensed_ns, estimated_ns + learned_ns - published_ns, due_ns, k)
         if newest:
             count_task(timing, ACTUATE, estimated_ns, actuated_ns, due_ns, k)
         count_task(timing, PUBLISH, actuated_ns, published_ns, due_ns, k)

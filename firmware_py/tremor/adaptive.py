@@ -24,7 +24,10 @@ from firmware_py.records import Array, Records, field, new, record
 from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import EstimatorParams, EstimatorState, Family, Samples
-from hal.compiled import inlined_kernel, kernel
+from hal.compiled import kernel
+
+STARTED, FED, LEARNED = range(3)
+"""Values of ``AdaptiveState.running``: no tick yet; a tick's data wait to be learned from; they have been."""
 
 
 @record
@@ -82,7 +85,7 @@ class AdaptiveState:
 
     bank: Array = field("sample", AXES, "m")
     pending: Array = field("sample", AXES, "channels")  # that the bank holds for this tick, measured or predicted
-    running: int = field("1")
+    running: int = field("1")  # STARTED, FED or LEARNED
     weigh: Array = field("sample", AXES, "channels", 2)
     weighted: Array = field("sample", AXES, "m")
     gate: Array = field("sample", AXES, 2)
@@ -232,12 +235,13 @@ def bank_add(bank: Array, channel: int, sample: float, params: AdaptiveParams) -
 
 @kernel
 def adaptive_tick(coasts: bool, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
-    """Advance to the next tick: learn from the last tick's data, and run the bank on with predicted samples."""
+    """Advance to the next tick: learn from the last tick's data if that is still to be done, and run the bank on with
+    predicted samples."""
     state, params = states.adaptive, param.adaptive
-    if state.running:
-        _learn(state, params)
+    adaptive_learn(0, states, param)
+    if state.running != STARTED:
         _ease(state, params)
-    state.running = 1
+    state.running = FED
     _, channels, m = params.onward.shape
     for i in range(AXES):
         bank = state.bank[i]
@@ -249,6 +253,14 @@ def adaptive_tick(coasts: bool, states: AdaptiveEstimator, param: AdaptiveNumber
         bank_turn(bank, params)
         for c in range(channels):
             bank_add(bank, c, state.pending[i, c], params)
+
+
+@kernel
+def adaptive_learn(_given: int, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
+    """Learn from the tick's data, once: the next tick needs it, this tick's output does not."""
+    if states.adaptive.running == FED:
+        _learn(states.adaptive, param.adaptive)
+        states.adaptive.running = LEARNED
 
 
 @kernel
@@ -290,7 +302,7 @@ def biquad_step(sample: float, memory: Array, c: Array) -> float:
     return out
 
 
-@inlined_kernel
+@kernel
 def _learn(state: AdaptiveState, params: AdaptiveParams) -> None:
     """Weighted bank and block sums take the last sample; at the end of a block the regression takes its row."""
     for i in range(AXES):
@@ -541,36 +553,54 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])
-    for i in range(m):
-        for j in range(i + 1):
-            total = a[i, j] * scale[i] * scale[j]
-            if i == j:
-                total += 1e-9
-            for k in range(j):
-                total -= a[i, k] * a[j, k]
-            if i > j:
-                a[i, j] = total / a[j, j]
-            elif total > 0.0:
-                a[i, i] = sqrt(total)
-            else:
-                return  # not positive definite to rounding (or not a number): the last filter stays
+    if not factorize(a, scale):
+        return  # not positive definite to rounding (or not a number): the last filter stays
     for o in range(OUTPUTS):
         x = right[o]
         for i in range(m):
-            total = x[i] * scale[i]
-            for k in range(i):
-                total -= a[i, k] * x[k]
-            x[i] = total / a[i, i]
+            x[i] *= scale[i]
+        for k in range(m):
+            x[k] /= a[k, k]
+            rest, above, value = x[k + 1 :], a[k, k + 1 :], x[k]
+            for i in range(len(rest)):
+                rest[i] -= above[i] * value
         for r in range(m):
             i = m - 1 - r
             total = x[i]
             for k in range(i + 1, m):
-                total -= a[k, i] * x[k]
+                total -= a[i, k] * x[k]
             x[i] = total / a[i, i]
         for i in range(m):
             state.solved[axis, level, o, i] = x[i] * scale[i]
 
 
+@kernel
+def factorize(a: Array, scale: Array) -> bool:
+    """Replace ``a`` (m, m), given by its lower triangle and scaled by ``scale`` (m,), by its Cholesky factor and, above
+    the diagonal, the factor's transpose. Return False if it is not positive definite.
+
+    A column is taken off all that is below it before the next one begins: the inner loops run along rows, and no sum
+    waits for itself."""
+    m = len(a)
+    for i in range(m):
+        for j in range(i + 1):
+            a[i, j] = a[i, j] * scale[i] * scale[j]
+        a[i, i] += 1e-9
+    for k in range(m):
+        if not a[k, k] > 0.0:
+            return False
+        a[k, k] = sqrt(a[k, k])
+        for i in range(k + 1, m):
+            a[i, k] /= a[k, k]
+            a[k, i] = a[i, k]
+        for i in range(k + 1, m):
+            row, above, factor = a[i, k + 1 : i + 1], a[k, k + 1 : i + 1], a[i, k]
+            for j in range(len(row)):
+                row[j] -= factor * above[j]
+    return True
+
+
 ADAPTIVE = Family(
-    AdaptiveNumbers, AdaptiveEstimator, adaptive_params, adaptive_state, adaptive_tick, adaptive_sample, adaptive_output
-)
+    AdaptiveNumbers, AdaptiveEstimator, adaptive_params, adaptive_state, adaptive_tick, adaptive_sample,
+    adaptive_output, adaptive_learn,
+)  # fmt: skip

@@ -83,6 +83,7 @@ FAMILY_OF: Mapping[str, str] = {
 _tick = ChosenKernel(FAMILIES, "tick")
 _sample = ChosenKernel(FAMILIES, "sample")
 _output = ChosenKernel(FAMILIES, "output")
+estimator_learn = ChosenKernel(FAMILIES, "learn")
 
 
 def estimator_params(config: TremorConfig) -> Records[EstimatorParams]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from firmware_py.records import Array, Records, field, record
 from firmware_py.tremor.combiner import CombinerParams, CombinerState
 from firmware_py.tremor.config import TremorConfig
+from hal.compiled import kernel
 
 AXES = 3
 TURNS = 2  # signals of an axis beside the tip's acceleration
@@ -58,6 +59,11 @@ class Samples(NamedTuple):
     up: Array
 
 
+@kernel
+def learn_nothing(_given: int, state: EstimatorState, params: EstimatorParams) -> None:
+    """Stand for ``Family.learn`` of an estimator whose ticks cost the same."""
+
+
 @dataclass(frozen=True)
 class Family:
     """An estimator, or several that differ by numbers alone.
@@ -69,6 +75,8 @@ class Family:
     - ``tick``: ``coasts``, true for a tick without a sample. The model runs on by one tick.
     - ``sample``: ``Samples`` of the present tick.
     - ``output``: the axis. Returns the tremor now, ahead by the loop's delay, and the core of the latter, m.
+    - ``learn``: nothing, 0. Does what the next ``tick`` would begin with and what needs nothing of that tick, so that
+      the next output is earlier. The numbers are the same without it.
     """
 
     params: type[EstimatorParams]
@@ -78,3 +86,4 @@ class Family:
     tick: Callable[[bool, Any, Any], None]
     sample: Callable[[Samples, Any, Any], None]
     output: Callable[[int, Any, Any], tuple[float, float, float]]
+    learn: Callable[[int, Any, Any], None] = learn_nothing

@@ -32,6 +32,7 @@ from firmware_py.tremor.estimator import (
     FREQUENCY,
     NOW,
     TRUST,
+    estimator_learn,
     estimator_output,
     estimator_params,
     estimator_samples,
@@ -97,6 +98,12 @@ def estimate_kernel(
     if state.ticks <= param.settle_ticks:
         status |= SETTLING
     frame[STATUS] = status
+
+
+@kernel
+def learn_kernel(frame: NDArray[np.float64], states: Records[EstimatorState], params: Records[EstimatorParams]) -> None:
+    """Do what ``estimate_kernel`` would begin the next tick with, see ``Family.learn``."""
+    estimator_learn(0, states[0], params[0])
 
 
 class Tremor:

@@ -9,6 +9,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import cont2discrete, lfilter
 
+from firmware_py.frame import INVALID, LAYOUT, QUATERNION, RESTARTED, STATUS, TICK, TIP_ACCELERATION
+from firmware_py.tremor.adaptive import LEARNED, factorize
 from firmware_py.tremor.adaptive_design import (
     GRID_STEP_HZ,
     band,
@@ -24,6 +26,8 @@ from firmware_py.tremor.adaptive_design import (
 )
 from firmware_py.tremor.config import PRESETS, AdaptiveConfig, TremorConfig
 from firmware_py.tremor.estimator import Estimator
+from firmware_py.tremor.family import AXES
+from firmware_py.tremor.stage import Tremor, learn_kernel
 from hal.errors import BenchError
 from tests.unit.tremor.compare import HELD_OUT, residuals
 from tests.unit.tremor.estimator_state import peek
@@ -352,3 +356,47 @@ def test_a_preset_is_the_start_and_the_keys_beside_it_override_it() -> None:
     assert AdaptiveConfig.model_validate(config.model_dump()) == config
     with pytest.raises(ValidationError, match="'loud tip' is no preset; there are still tip"):
         AdaptiveConfig.model_validate({"preset": "loud tip"})
+
+
+def test_learning_when_the_output_is_out_gives_the_same_bits() -> None:
+    """Some ticks learn at once, others in the next one; there is a restart and a gap."""
+    late, early = Tremor(CONFIG), Tremor(CONFIG)
+    rng = np.random.default_rng(5)
+    samples = np.cumsum(rng.standard_normal((4000, AXES)), axis=0) * 0.01
+    frames = [np.zeros(LAYOUT.size) for _ in range(2)]
+    learned = []
+    for k, sample in enumerate(samples):
+        for frame in frames:
+            frame[TICK] = k + 7 * (k > 3000)
+            frame[STATUS] = RESTARTED if k == 500 else INVALID if k % 97 == 0 else 0
+            frame[TIP_ACCELERATION : TIP_ACCELERATION + AXES] = sample
+            frame[QUATERNION] = 1.0
+        late.step(frames[0])
+        early.step(frames[1])
+        np.testing.assert_array_equal(frames[0], frames[1])
+        if k % 3:
+            before = early.state["adaptive"]["solved"].copy()
+            learn_kernel(frames[1], early.state, early.params)
+            learn_kernel(frames[1], early.state, early.params)  # once is enough
+            assert early.state["adaptive"]["running"][0] == LEARNED
+            learned.append(bool((early.state["adaptive"]["solved"] != before).any()))
+    assert any(learned)
+    learn_kernel(frames[0], late.state, late.params)
+    learn_kernel(frames[1], early.state, early.params)
+    np.testing.assert_array_equal(late.state, early.state)
+
+
+def test_the_factor_is_cholesky_s_and_an_indefinite_matrix_has_none() -> None:
+    rng = np.random.default_rng(6)
+    half = rng.standard_normal((72, 72))
+    whole = half @ half.T
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    a = np.tril(whole)
+    assert factorize(a, scale)
+    expected = np.linalg.cholesky(whole * np.outer(scale, scale) + 1e-9 * np.eye(72))
+    np.testing.assert_allclose(np.tril(a), expected, atol=1e-12)
+    np.testing.assert_array_equal(np.triu(a), np.tril(a).T)
+    whole[40, 40] = -1.0
+    assert not factorize(np.tril(whole), np.ones(72))
+    whole[40, 40] = np.nan
+    assert not factorize(np.tril(whole), np.ones(72))

@@ -46,13 +46,18 @@ def read_until(port: Any, end: bytes, timeout_s: float = 5.0) -> bytes:
     return got
 
 
-def test_daq_over_pyserial_counts_every_scan(world: ProcessWorld) -> None:
+def configured_daq(world: ProcessWorld) -> Any:
     port = open_serial(world.endpoint("daq0"))
     port.write(b"stop\r", 1.0)
     read_until(port, b"stop\r")
     for text in (b"info 1", b"srate 60000", b"dec 1", *(b"slist %d %d" % (i, 256 + i) for i in range(8))):
         port.write(text + b"\r", 1.0)
         assert read_until(port, b"\r").startswith(text)
+    return port
+
+
+def test_daq_over_pyserial_counts_every_scan(world: ProcessWorld) -> None:
+    port = configured_daq(world)
     port.write(b"start 0\r", 1.0)
     data, buffer = b"", memoryview(bytearray(65536))
     while len(data) < 300 * 16:
@@ -86,6 +91,23 @@ def test_i2c_over_the_socket(world: ProcessWorld) -> None:
     world.inject("ack", "piezo")
     assert len(bus.transfer(0x0C, [I2cRead(2)])) == 2
     bus.close()
+
+
+def test_a_busy_bus_beside_the_scans_keeps_both_whole(world: ProcessWorld) -> None:
+    port = configured_daq(world)
+    port.write(b"start 0\r", 1.0)
+    bus = open_i2c(world.endpoint("i2c1"))
+    data, buffer = b"", memoryview(bytearray(65536))
+    while len(data) < 500 * 16:
+        assert bus.transfer(0x48, [I2cWrite(b"\x01"), I2cRead(2)]) == b"\x85\x83"
+        data += bytes(buffer[: port.read_into(buffer, 0.0)])
+    port.write(b"stop\r", 1.0)
+    data += read_until(port, b"stop\r")
+    scans = np.frombuffer(data[: len(data) - 5], "<i2").reshape(-1, 8)
+    steps = np.diff(scans[:, 0].astype(float)) * 5.0 / 32768 * 1000
+    assert np.count_nonzero(np.abs(steps - 1.0) > 0.2) <= 1  # the ramp starts again every 5 s
+    bus.close()
+    port.close()
 
 
 def test_can_over_a_socket_carries_the_stop_button(world: ProcessWorld) -> None:
