@@ -9,8 +9,16 @@ import pytest
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.frame import LAYOUT, TREMOR_AHEAD
-from tools.reports.figures import BANDS_HZ, BandFigures, Spectrum, TremorFigures
-from tools.research.reports.hand_limits import AboveBand, Swing, above_band, band_rms_um, known_tremor_um, strongest
+from tools.reports.figures import BANDS_HZ, TREMOR_BAND_HZ, BandFigures, Spectrum, TremorFigures
+from tools.research.reports.hand_limits import (
+    ABOVE_HZ,
+    BandParts,
+    Swing,
+    band_parts,
+    band_rms_um,
+    known_tremor_um,
+    strongest,
+)
 from tools.research.reports.hands import HANDS, METHODS, UNSEEN, HandRow, draw_people, markdown, people_table
 
 T_S = np.arange(4000) / 1000.0
@@ -102,12 +110,17 @@ def test_above_the_band_a_known_tremor_within_the_strokes_leaves_the_hand_and_a_
     truth = {"tip_rigid_m": tip, "intended_m": np.zeros_like(tip), "tip_m": 3.0 * tip}
     frames = np.zeros((11_000, LAYOUT.size))
     frames[:, TREMOR_AHEAD + 1] = 2e-6 * np.sin(2 * np.pi * 60.0 * t_s[1000:])
-    found = above_band(truth, frames, (t_s > 4.0) & (t_s < 11.0), np.eye(3), ActuationConfig())
+    parts = band_parts(truth, frames, (t_s > 4.0) & (t_s < 11.0), np.eye(3), ActuationConfig())
+    found, core = parts[ABOVE_HZ], parts[TREMOR_BAND_HZ]
     one = 1.0 / np.sqrt(2.0)
     assert found.hand_um == pytest.approx(one, rel=0.01)
     assert found.known_um == pytest.approx(one, rel=0.05)
     assert found.wish_um == pytest.approx(np.sqrt(5.0) * one, rel=0.01)
     assert found.tip_um == pytest.approx(3.0 * one, rel=0.01)
+    assert core.hand_um == pytest.approx(10.0 * one, rel=0.01)
+    assert core.known_um < 0.05 * core.hand_um  # 10 um fit every stroke
+    assert core.wish_um == pytest.approx(10.0 * one, rel=0.01)
+    assert core.tip_um == pytest.approx(30.0 * one, rel=0.01)
 
 
 def test_the_page_says_what_is_added_above_the_band_and_what_room_the_strokes_leave() -> None:
@@ -117,11 +130,19 @@ def test_the_page_says_what_is_added_above_the_band_and_what_room_the_strokes_le
     swing = Swing(9.0, 3.0, 0.9, 74.0, 5.0)
     rows = [
         HandRow(name, "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, 30.0, above)
-        for name, above in (("still", AboveBand(3.0, 2.9, 3.1, 3.4)), ("wide", AboveBand(0.9, 1.5, 1.5, 4.1)))
+        for name, above in (("still", BandParts(3.0, 2.9, 3.1, 3.4)), ("wide", BandParts(0.9, 1.5, 1.5, 4.1)))
     ]
     page = markdown(rows, 8.0, "x")
     assert "| still | 3.00 | 3.40 | 1.60 | 0.00 | 2.00 | 0.78 | met |" in page
     assert "| wide | 0.90 | 4.10 | 4.00 | 1.20 | 1.60 | 1.20 | missed |" in page
+
+
+def test_the_page_says_what_strokes_and_estimator_leave_of_the_tremor() -> None:
+    vector = BandFigures(40.0, 18.0, 55.0)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, dict.fromkeys(BANDS_HZ, vector), 1.0, 0.0)
+    swing, core = Swing(9.0, 3.0, 0.9, 74.0, 5.0), BandParts(40.0, 10.0, 7.5, 18.0)
+    page = markdown([HandRow("wide", "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, 30.0, None, core)], 8.0, "x")
+    assert "| wide | 40.00 | 18.00 | 10.00 | 7.50 | 17.50 | 75.0 |" in page
 
 
 def test_parts_that_no_setting_has_seen_are_of_hands_that_are_run() -> None:

@@ -95,8 +95,8 @@ def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: A
 
 
 @dataclass(frozen=True)
-class AboveBand:
-    """Motion of the tip in 20 to 500 Hz, um rms, and what carries it.
+class BandParts:
+    """Motion of the tip in a band, um rms, and what carries it.
 
     ``known_um``: with the tremor known beforehand and these strokes, which a better estimate of the same motion does
     not lower. ``wish_um``: by the estimator, if no stroke ended and the actuators did exactly what it says.
@@ -112,10 +112,10 @@ class AboveBand:
         return float(np.sqrt(max(whole_um**2 - self.hand_um**2, 0.0)))
 
 
-def above_band(
+def band_parts(
     truth: Mapping[str, Array], frames: Array, keep: NDArray[np.bool_], body: Array, config: ActuationConfig
-) -> AboveBand:
-    """Return the figures of a run over the rows ``keep`` of its truth.
+) -> dict[tuple[float, float], BandParts]:
+    """Return the parts of the tremor band and of the band above it, over the rows ``keep`` of a run's truth.
 
     ``frames`` (m, Layout.size) of every tick, the last of the truth's rows; ``body`` as for ``known_tremor``.
     """
@@ -123,7 +123,10 @@ def above_band(
     wish = np.zeros_like(moved)
     wish[len(moved) - len(frames) :] = -config.gain * frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3]
     ways = (moved, known_tremor(truth, body, config), moved + wish, tip)
-    return AboveBand(*(band_rms_um(x - x[keep].mean(axis=0), keep, ABOVE_HZ) for x in ways))
+    return {
+        hz: BandParts(*(band_rms_um(x - x[keep].mean(axis=0), keep, hz) for x in ways))
+        for hz in (TREMOR_BAND_HZ, ABOVE_HZ)
+    }
 
 
 def causal_um(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> float:

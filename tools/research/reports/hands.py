@@ -21,8 +21,16 @@ from sim_devices.config import emulation_config
 from sim_devices.plant.hand_file import load_hand
 from sim_devices.plant.recorded_hand import make_hand
 from tools.closed_loop.simulate import simulate
-from tools.reports.figures import BANDS_HZ, SHOWN_HZ, TremorFigures, density_text, tremor_figures
-from tools.research.reports.hand_limits import AboveBand, Swing, above_band, causal_um, known_tremor_um, strongest
+from tools.reports.figures import BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, TremorFigures, density_text, tremor_figures
+from tools.research.reports.hand_limits import (
+    ABOVE_HZ,
+    BandParts,
+    Swing,
+    band_parts,
+    causal_um,
+    known_tremor_um,
+    strongest,
+)
 
 METHODS = ("adaptive", "kalman", "wflc_flc")
 SETTLE_S = 5.0
@@ -58,7 +66,9 @@ class HandRow:
     swing: Swing
     recorded_s: float = float("inf")
     """Length of the recording: a run that is longer plays it again. ``inf``: a hand that is not recorded."""
-    above: AboveBand | None = None
+    above: BandParts | None = None
+    core: BandParts | None = None
+    """Parts of the motion above the tremor band, and of the tremor."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -72,6 +82,7 @@ class HandRow:
             "causal_limit_um": self.causal_limit_um,
             "swing": asdict(self.swing),
             "above_band": None if self.above is None else asdict(self.above),
+            "tremor_band": None if self.core is None else asdict(self.core),
             **self.figures.to_json(),
         }
 
@@ -120,12 +131,14 @@ def run_hand(
         progress(f"{name}, limits")
         limits = known_tremor_um(run.truth, keep, body, run.configs.actuation), causal_um(run.truth, keep)
     assert run.frames is not None
-    above = above_band(run.truth, run.frames, keep, body, run.configs.actuation)
+    parts = band_parts(run.truth, run.frames, keep, body, run.configs.actuation)
     limited = 100.0 * run.clipped / (1000.0 * seconds)
     where = Path(source).name if source else "-"
     swing = strongest(run.truth, from_ns, run.safe_ns)
     used = run.configs.tremor.method
-    return HandRow(name, where, used, figures, limited, *limits, swing, recorded_s, above)
+    return HandRow(
+        name, where, used, figures, limited, *limits, swing, recorded_s, parts[ABOVE_HZ], parts[TREMOR_BAND_HZ]
+    )
 
 
 def draw_people(revision: str, count: int) -> list[int]:
@@ -228,6 +241,7 @@ def markdown(
         "and everything below 2 Hz. At a limit: the wanted displacement was out of the manipulator's reach or the",
         "amplifier's range. Motion below the tremor band yields its stroke to the band, so its error can stay large.",
         "",
+        *core_lines([row for row in rows if row.method == METHODS[0]]),
         *above_lines([row for row in rows if row.method == METHODS[0]]),
         *spectrum_lines([row for row in rows if row.method == METHODS[0]]),
         *(people_table(people, seeds) if people else ()),
@@ -275,6 +289,30 @@ def above_lines(rows: Sequence[HandRow]) -> list[str]:
             figures = (a.hand_um, a.tip_um, tip, strokes, room, estimator)
             verdict = "met" if tip <= GOAL_ABOVE_UM else "missed"
             lines.append(f"| {escaped(row.hand)} | {' | '.join(f'{um:.2f}' for um in figures)} | {verdict} |")
+    return [*lines, ""]
+
+
+def core_lines(rows: Sequence[HandRow]) -> list[str]:
+    """Return the section of the page on what strokes and estimator leave of the tremor, each alone."""
+    text = (
+        "um rms in 8-12 Hz, as vectors. By the strokes: left if the tremor were known beforehand, with strokes used as "
+        "on the instrument: motion beyond them is made smaller instead of cut off, so that its corners do not shake "
+        "the tip above 20 Hz. By the estimator: left if no stroke ended. Where both fail at the same time, what they "
+        "leave adds up, and a better estimate cannot leave less than the strokes do."
+    )
+    lines = [
+        "## Tremor that strokes and estimator leave",
+        "",
+        *wrap(text, 110),
+        "",
+        "| hand | without | with compensation | by the strokes | by the estimator | their sum | strokes allow (%) |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        if (c := row.core) is not None:
+            figures = (c.hand_um, c.tip_um, c.known_um, c.wish_um, c.known_um + c.wish_um)
+            allowed = 100.0 * (1.0 - c.known_um / c.hand_um)
+            lines.append(f"| {escaped(row.hand)} | {' | '.join(f'{um:.2f}' for um in figures)} | {allowed:.1f} |")
     return [*lines, ""]
 
 

@@ -26,6 +26,7 @@ from tools.research.reports.hands import (
     SETTLE_S,
     HandRow,
     above_lines,
+    core_lines,
     escaped,
     explain_miss,
     run_hand,
@@ -215,6 +216,7 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
         "causal linear filter, fitted to this very hand and with sensor noise, would take away if no stroke ended.",
         "Other bands: error against the intended path.",
         "",
+        *core_lines(rows),
         *above_lines(rows),
         *spectrum_lines(rows),
     ]
