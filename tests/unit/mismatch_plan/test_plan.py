@@ -186,6 +186,15 @@ def test_a_slow_input_groups_lag_and_delay_and_a_sweep_would_split_them(recorded
     assert fast.groups == ()
 
 
+def test_an_effect_that_a_more_general_one_imitates_everywhere_is_listed(recorded: Path):
+    where = situation(recorded)
+    effects = [EFFECTS[n] for n in ("hysteresis", "rate_dependent_hysteresis", "dead_time")]
+    box = {"command": settle_limits(Wish(), "V", 1 / RATE_HZ, where.template.inputs["command"], "x", None)}
+    found = separable(where, box, SIGMA, size=3.0, effects=effects)
+    assert found.imitated == (("hysteresis", "rate_dependent_hysteresis"),)
+    assert found.groups == ()
+
+
 @pytest.fixture(scope="module")
 def planned(recorded: Path) -> tuple[Situation, Plan]:
     where = open_situation(recorded, Asked())

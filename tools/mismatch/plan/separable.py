@@ -60,8 +60,10 @@ class Splitter:
 class Separable:
     """Holds the separable effects.
 
-    ``groups``: effects of which each is too close to the next; ``not_moved``: effects that this input does not excite;
-    ``not_here``: effects that these channels cannot have, with the reason.
+    ``groups``: effects of which each is too close to the next; ``imitated``: (effect, rival) where the rival imitates
+    the effect on this input and on every described one, so that no waveform speaks for the effect, though one may speak
+    for the rival; ``not_moved``: effects that this input does not excite; ``not_here``: effects that these channels
+    cannot have, with the reason.
     """
 
     input: str
@@ -71,6 +73,7 @@ class Separable:
     pairs: tuple[Pair, ...]
     groups: tuple[tuple[str, ...], ...]
     splitters: tuple[Splitter, ...]
+    imitated: tuple[tuple[str, str], ...]
     not_moved: tuple[str, ...]
     not_here: Mapping[str, str]
 
@@ -132,7 +135,8 @@ def separable(
     on = ground(course, sigma, seed)
     found = _strongest(responses(on, catalogue, size))
     pairs = [pair_of(a, b) for i, a in enumerate(found) for b in found[i + 1 :]]
-    close = [p for p in pairs if p.size > size]
+    one_way = [p for p in pairs if max(p.sizes) > size]
+    best = _best_sizes(where, limits, sigma, size, seed, one_way)
     absent = {e.name: why for e in catalogue if (why := why_not(on.problem.twin, course, e))}
     moved = {r.effect.name for r in found}
     return Separable(
@@ -145,38 +149,44 @@ def separable(
         ),
         tuple(sorted(pairs, key=lambda p: -p.size)),
         groups_of(pairs, size),
-        tuple(_splitters(where, limits, sigma, size, seed, close)),
+        tuple(_splitter(p, size, best[p.names]) for p in one_way if p.size > size),
+        tuple(
+            (p.names[k], p.names[1 - k]) for p in one_way for k in (0, 1) if min(p.sizes[k], best[p.names][k][0]) > size
+        ),
         tuple(sorted(e.name for e in catalogue if e.name not in moved and e.name not in absent)),
         absent,
     )
 
 
-def _splitters(
+Best = tuple[tuple[float, str], tuple[float, str]]
+"""For either effect of a pair the smallest size from which the other cannot imitate it, and the input in words."""
+
+
+def _best_sizes(
     where: Situation, limits: Mapping[str, Limits], sigma: Mapping[str, float], size: float, seed: int,
-    close: Sequence[Pair],
-) -> list[Splitter]:  # fmt: skip
-    """Return the described input that splits each close pair at the smallest size, else the experiment in words."""
-    if not close:
-        return []
-    wanted = {n for p in close for n in p.names}
-    effects = [EFFECTS[n] for n in sorted(wanted) if n in EFFECTS]
-    best: dict[tuple[str, str], tuple[float, str]] = {}
-    for words, (family, z) in LIBRARY.items():
+    pairs: Sequence[Pair],
+) -> dict[tuple[str, str], Best]:  # fmt: skip
+    """Return the best of the described inputs for each of some pairs, infinite where none excites both effects."""
+    best: dict[tuple[str, str], Best] = {p.names: ((np.inf, ""), (np.inf, "")) for p in pairs}
+    effects = [EFFECTS[n] for n in sorted({n for p in pairs for n in p.names}) if n in EFFECTS]
+    for words, (family, z) in LIBRARY.items() if pairs else ():
         course = where.course({s: draw(family, np.asarray(z), box, where.dt) for s, box in limits.items()})
         found = {r.effect.name: r for r in _strongest(responses(ground(course, sigma, seed), effects, size))}
-        for p in close:
+        for p in pairs:
             a, b = (found.get(n) for n in p.names)
-            if a is not None and b is not None and (now := pair_of(a, b).size) < best.get(p.names, (np.inf, ""))[0]:
-                best[p.names] = (now, words)
-    out: list[Splitter] = []
-    for p in close:
-        value, words = best.get(p.names, (np.inf, ""))
-        if value <= size:
-            out.append(Splitter(p.names, words, value))
-            continue
-        a, b = (EFFECTS[n] for n in p.names)
-        out.append(Splitter(p.names, experiment(a, b), None))
-    return out
+            if a is not None and b is not None:
+                now, old = pair_of(a, b).sizes, best[p.names]
+                best[p.names] = (min(old[0], (now[0], words)), min(old[1], (now[1], words)))
+    return best
+
+
+def _splitter(p: Pair, size: float, best: Best) -> Splitter:
+    """Return the described input that splits a close pair at the smallest size, else the experiment in words."""
+    value, words = min(best)
+    if value <= size:
+        return Splitter(p.names, words, value)
+    a, b = (EFFECTS[n] for n in p.names)
+    return Splitter(p.names, experiment(a, b), None)
 
 
 def channel_gains(

@@ -33,6 +33,9 @@ def print_prospect(p: Prospect, say: Console) -> None:
     for s in p.found.splitters:
         at = f" would split them from {s.size:.2g} noise rms on" if s.size is not None else " (not simulated)"
         say.print(f"  {words(s.names)}: {s.what}{at}", highlight=False, soft_wrap=True)
+    if p.found.imitated:
+        pairs = "; ".join(f"{words((a,))} by {words((b,))}" for a, b in p.found.imitated)
+        say.print(f"Imitated on every input tried: {pairs}.", highlight=False, soft_wrap=True)
     if p.found.not_moved:
         say.print(f"Not shown by this input: {words(p.found.not_moved)}.", highlight=False, soft_wrap=True)
     for signal, names in p.channels.items():

@@ -244,13 +244,12 @@ def predicted(course: Recording, rivals: tuple[Rival, Rival], sigma: dict[str, f
 
 
 def says_alike(group: Group) -> bool:
-    """Return True if the analysis of ``micron mismatch plan`` knows no input that splits the pair at its size."""
+    """Return True if the analysis of ``micron mismatch plan`` says that the rival imitates the effect everywhere."""
     signal = next(iter(group.where.template.inputs))
     box = {signal: settle_limits(WISH, group.where.template.unit[signal], 1 / RATE_HZ, None, group.twin, None)}
-    effects = [EFFECTS[r.name] for r in group.rivals]
-    found = separable(group.where, box, group.sigma, size=group.severity, effects=effects)
-    close = [s for s in found.splitters if set(s.names) == {e.name for e in effects}]
-    return any(s.size is None for s in close)
+    name, other = (r.name for r in group.rivals)
+    found = separable(group.where, box, group.sigma, size=group.severity, effects=[EFFECTS[name], EFFECTS[other]])
+    return (name, other) in found.imitated
 
 
 def least_waves(group: Group, waves: Mapping[str, Array]) -> tuple[dict[str, Array], float]:

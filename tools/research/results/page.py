@@ -51,6 +51,8 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-measured": (),
     "mismatch-gate": ("First run", "The same cases again"),
     "heal": ("Kept remedies", "Reverted remedies"),
+    "plan": ("Why a planned", "By pair", "Pairs that"),
+    "together": ("Not named",),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
 
