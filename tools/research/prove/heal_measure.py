@@ -157,6 +157,15 @@ def page(rows: Sequence[dict[str, Any]], seconds: float) -> str:
     worse = [f"{r['change']}: {', '.join(r['worse'])}" for r in rows if r["worse"]]
     missing = [name for name in CHANGES if name not in {r["change"] for r in rows}]
     reverted = [f"{r['change']}, {s['part']}: {s['why']}" for r in rows for s in r["steps"] if not s["kept"]]
+    stamps = {r["revision"].partition(",")[0] for r in rows}
+    known = [r["known"]["8-12 Hz"] for r in rows if CHANGES[r["change"]].told is None]
+    mixed = (
+        f"""- The rows are of {len(stamps)} revisions, between which the firmware changed: compare each with its known
+  figures (8-12 Hz: {min(known):.2f} to {max(known):.2f} um on the unchanged bench).
+"""
+        if len(stamps) > 1 and known
+        else ""
+    )
     kept = [
         f"{r['change']}, {s['part']}: {s['why']}{s['balance'] and '; tremor estimator: '}{s['balance']}"
         for r in rows
@@ -178,7 +187,7 @@ not in it.
 - Benches with a band that is worse than before (paired t-test over the judging runs, level {LEVEL:g}):
   {"; ".join(worse) or "none"} of {len(rows)}.
 - Not run: {", ".join(missing) or "none"}.
-- The engine was not asked for names, which do not change the remedies (`--without-names`):
+{mixed}- The engine was not asked for names, which do not change the remedies (`--without-names`):
   {sum(not r["with_names"] for r in rows)} of {len(rows)}.
 - CPU: {sum(r["cpu_s"] for r in rows):.0f} s.
 
