@@ -59,5 +59,6 @@ def test_a_source_costs_what_the_error_gains_by_it_in_each_band(monkeypatch: pyt
 
 def test_the_last_rows_keep_still_above_the_band_as_the_bench_does() -> None:
     """The bound beside which ``ideal_changes`` is run pays nothing there; a budget of that band does."""
-    ideal = sources(BENCH)["all errors of sensors and actuators"]["firmware"]["tremor"]["adaptive"]
-    assert "quiet" not in ideal
+    ideal = sources(BENCH)["all errors of sensors and actuators"]["firmware"]
+    assert not {"quiet", "above"} & set(ideal["tremor"]["adaptive"])
+    assert "overdrive" not in ideal["actuation"]

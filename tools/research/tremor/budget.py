@@ -71,8 +71,10 @@ def sources(bench: Path) -> dict[str, Changes]:
         out[name] = {"emulation": emulation, "firmware": {"calibration": kept, **firmware}}
     for name, noise in ((f"{ALL_ERRORS} but accelerometer noise", True), (ALL_ERRORS, False)):
         out[name] = ideal_changes(noise)
-        # the estimator is the bench's own here: it keeps still above the band
-        del out[name]["firmware"]["tremor"]["adaptive"]["quiet"]
+        # estimator and strokes are the bench's own here: they keep still above the band
+        ideal = out[name]["firmware"]
+        del ideal["tremor"]["adaptive"]["quiet"], ideal["tremor"]["adaptive"]["above"]
+        del ideal["actuation"]["overdrive"]
     return out
 
 
