@@ -25,6 +25,7 @@ from drivers.daq.di4108_kernels import READY, accept, decode
 from drivers.piezo.dac_output import DacOutput
 from drivers.piezo.e727 import E727
 from firmware_py.control.wiring import Devices, open_devices
+from firmware_py.machine.waiting import kept_waiting_ns
 from firmware_py.machine.workers import WORKER_PRIORITY
 from firmware_py.run_request import LOOP_PRIORITY, RunRequest, open_requested
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
@@ -51,11 +52,18 @@ SCANS, LATE, SENT, DT_NS, EVERY, DAQ_FD, OUTPUT_FD = range(7)
 
 class Bare(NamedTuple):
     """Holds the times of a bare loop from scan to command, us, the share of scans that had no command of their own
-    because they came with a newer one, %, and the time in ms that the host took from the machine."""
+    because they came with a newer one, %, the time in ms that the host took from the machine, and the time in ms for
+    which the kernel kept the loop waiting."""
 
     late_us: list[float]
     without_command: float
     stolen_ms: float
+    kept_waiting_ms: float
+
+    @property
+    def host(self) -> str:
+        """Say what host and kernel did meanwhile."""
+        return f"host took {self.stolen_ms:g} ms, kernel {self.kept_waiting_ms:.1f} ms"
 
 
 @thread_kernel
@@ -152,17 +160,17 @@ def measure(file: Path, seconds: float, tick_hz: int, *, polls: bool = False) ->
             daq.start()
             if serve(words, stream, buffer, rows, text, command, np.zeros(WARM_UP, np.int64)):
                 words[SCANS] = words[LATE] = words[SENT] = 0
-                before_ms = stolen_ms()
+                before_ms, before_ns = stolen_ms(), kept_waiting_ns()
                 with polled(devices, opened.clock) if polls else nullcontext():
                     is_whole = serve(words, stream, buffer, rows, text, command, late_ns)
             else:
-                is_whole, before_ms = False, 0.0
+                is_whole, before_ms, before_ns = False, 0.0, 0
+            taken_ms, waited_ms = stolen_ms() - before_ms, (kept_waiting_ns() - before_ns) * 1e-6
         if not is_whole:
             raise RuntimeError("the scans ended before the bare loop did")
-        taken_ms = stolen_ms() - before_ms
         daq.stop()
         output.close()
-    return Bare((late_ns * 1e-3).tolist(), 100.0 * words[LATE] / words[SCANS], taken_ms)
+    return Bare((late_ns * 1e-3).tolist(), 100.0 * words[LATE] / words[SCANS], taken_ms, waited_ms)
 
 
 if __name__ == "__main__":

@@ -79,9 +79,12 @@ class Run(NamedTuple):
 
     @property
     def without_command(self) -> float:
-        """Share of scans, in %, that did not get a tick of their own: skipped, or caught up with in a later tick. The
-        ones that came while the outputs were being armed are left out: nothing could be commanded then."""
-        ticks = self.outcome["ticks"]
+        """Share of scans, in %, that did not get a tick of their own: skipped, or caught up with in a later tick.
+        Nothing can be commanded before the outputs are armed: of a compiled run the scans since its thread was entered
+        first count, of a run in Python all but the ones that came while the outputs were being armed."""
+        ticks, loop = self.outcome["ticks"], self.outcome.get("loop", {})
+        if "passed_over" in loop:
+            return 100.0 * loop["passed_over"] / max(loop["ticks"] + loop["passed_over"], 1)
         arming = sum(one["caught_up"] + one["skipped_ticks"] for one in ticks["announced"].values())
         without = ticks["caught_up"] + ticks["skipped"] - arming
         return 100.0 * without / max(ticks["run"] + without, 1)
@@ -96,9 +99,12 @@ class Run(NamedTuple):
 
     @property
     def host(self) -> str:
-        """What the host did meanwhile: the processors' "steal" of /proc/stat, and the world's own pauses."""
+        """Say what host and kernel did meanwhile: "steal" of /proc/stat, the time for which the thread was ready and
+        did not run, and the world's pauses."""
         stalls, longest_ms = self.outcome["host"]["stalls"], self.outcome["host"]["longest_stall_ms"]
-        return f"host took {self.stolen_ms:g} ms, {stalls} pauses of the world (longest {longest_ms:.1f} ms)"
+        waited_ms = self.outcome.get("loop", {}).get("kept_waiting_ms")
+        kernel = "" if waited_ms is None else f", kernel {waited_ms:.1f} ms"
+        return f"host took {self.stolen_ms:g} ms{kernel}, {stalls} pauses of the world (longest {longest_ms:.1f} ms)"
 
 
 # -- the bare loop -----------------------------------------------------------------------------------------
@@ -183,7 +189,7 @@ def rows() -> Iterator[Row]:
         after = measure_bare(setup)
         bare = Bare(
             before.late_us + after.late_us, (before.without_command + after.without_command) / 2,
-            before.stolen_ms + after.stolen_ms,
+            before.stolen_ms + after.stolen_ms, before.kept_waiting_ms + after.kept_waiting_ms,
         )  # fmt: skip
         for kind, run in runs.items():
             if setup.tick_hz == 1000:
@@ -202,7 +208,7 @@ def polled_rows(setup: Setup, polled: Bare, bare: Bare) -> Iterator[Row]:
         ours, peer = (float(np.percentile(each.late_us, share)) for each in (polled, bare))
         yield Row(
             f"sample to command, {setup.name}, bare loop beside the slow converters, {name}",
-            f"a Python thread polls them; host took {polled.stolen_ms:g} ms", ours, peer, "bare loop, same wires", "us",
+            f"a Python thread polls them; {polled.host}", ours, peer, "bare loop, same wires", "us",
             ours / peer,
         )  # fmt: skip
 
@@ -214,7 +220,7 @@ def latency_rows(setup: Setup, kind: str, run: Run, bare: Bare) -> Iterator[Row]
         yield Row(
             f"sample to command, {setup.name}, {kind}, {name}", run.what, ours, peer, "bare loop, same wires", "us",
             ours / peer, f"<= {factor:g} x" if must else "-", ours <= factor * peer if must else None, must=must,
-            why=f"{run.host}; beside the bare loop {bare.stolen_ms:g} ms" if must else "",
+            why=f"{run.host}; bare loop: {bare.host}" if must else "",
         )  # fmt: skip
 
 
@@ -226,7 +232,7 @@ def missed_row(setup: Setup, kind: str, run: Run, bare: Bare) -> Row:
         f"ticks without a command, {setup.name}, {kind}", f"skipped or caught up with in a later tick; {run.what}",
         run.without_command, late, "the same of the bare loop", "%", run.without_command / late,
         f"<= {factor:g} x" if must else "-", run.without_command <= factor * late if must else None, must=must,
-        why="ticks of self-test and holds are Python's" if must else "",
+        why=f"{run.host}; bare loop: {bare.host}" if must else "",
     )  # fmt: skip
 
 

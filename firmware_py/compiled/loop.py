@@ -29,6 +29,7 @@ from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.instrument import LATE_PART, Micron
 from firmware_py.control.stages import Stages
 from firmware_py.control.wiring import Daq, Devices
+from firmware_py.machine.waiting import kept_waiting_ns
 from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.recording.ring import RowsView
 from firmware_py.run.context import Run
@@ -78,7 +79,8 @@ class CompiledMicron(Micron):
 
     Raises ``BenchError`` for others. ``spin_us``: the thread waits awake from so long before each scan is expected
     until so long after. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks that it
-    ran."""
+    ran. In real time the report also has ``passed_over``, the scans without a tick of their own since the first entry,
+    and ``kept_waiting_ms``, see ``kept_waiting_ns``."""
 
     def __init__(
         self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run, *, spin_us: float = 0.0
@@ -107,7 +109,8 @@ class CompiledMicron(Micron):
         self._words = np.zeros(at.N_WORDS, np.int64)
         self._words[at.SPIN_NS] = round(spin_us * 1e3)
         self._processors = os.sched_getaffinity(0)
-        self._inside_ns = self._sync_due_ns = 0
+        self._inside_ns = self._kept_waiting_ns = self._sync_due_ns = 0
+        self._passed_over_before = 0
         self._counted = self._words.copy()
         self._tasks_counted = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
         self._memory: Memory | None = None
@@ -174,7 +177,11 @@ class CompiledMicron(Micron):
         if self._words[at.SPIN_NS]:
             share = int(self._words[at.SPUN_NS]) / max(self._inside_ns, 1)
             spin = {"spin_us": int(self._words[at.SPIN_NS]) * 1e-3, "spin_share": share}
-        how = {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **spin}
+        real = {}
+        if self.entries and not self._is_virtual:
+            passed_over = self.run.scheduler.passed_over - self._passed_over_before
+            real = {"passed_over": passed_over, "kept_waiting_ms": self._kept_waiting_ns * 1e-6}
+        how = {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **real, **spin}
         return {**super().report(), "loop": how}
 
     # -- running -----------------------------------------------------------------------------------------
@@ -249,6 +256,10 @@ class CompiledMicron(Micron):
         self._output.begin()
         if self._is_virtual:
             self._feed(last_due_ns)
+        else:
+            if not self.entries:
+                self._passed_over_before = self.run.scheduler.passed_over
+            self._kept_waiting_ns -= kept_waiting_ns()
         words[at.BEAT_NS] = self.run.clock.now_ns()
         words[at.ORDER] = (
             at.CALLED_BACK if self.run.signals.interrupted else at.GO
@@ -258,6 +269,8 @@ class CompiledMicron(Micron):
         entered_ns = self.run.clock.now_ns()
         result = self._thread.serve(memory)
         self._inside_ns += self.run.clock.now_ns() - entered_ns
+        if not self._is_virtual:
+            self._kept_waiting_ns += kept_waiting_ns()
         with self._lock:
             self._is_inside.clear()
             words[at.ORDER] = at.CALLED_BACK

@@ -243,7 +243,8 @@ SETTINGS = (
     MachineSetting(
         "preemption", "PREEMPT_RT", "kernel",
         "another kernel finishes what it is doing before a task of real-time priority runs",
-        "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)",
+        "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or add 'preempt=full' to the command line of a "
+        "PREEMPT_DYNAMIC kernel",
         _preemption,
     ),
 )  # fmt: skip

@@ -372,6 +372,11 @@ class Scheduler:
         return self._skipped_ticks
 
     @property
+    def passed_over(self) -> int:
+        """Return the number of ticks that never ran or were only caught up with since the last ``reset``."""
+        return self._skipped_ticks + self._caught_up
+
+    @property
     def worst_tick_ns(self) -> int:
         """Return the duration of the longest tick since the last ``reset``."""
         return self._tick_duration.max_ns
