@@ -69,10 +69,11 @@ def run_with(folder: Path, bench: str, fault: Fault) -> tuple[dict[str, Any], di
 
     request = RunRequest(file, LIMIT_S, pace="realtime", stale_ms=300.0, compiled=True)
     outcome, truth = run_in_process(request, strike_once, folder, opened_bench.append)
-    assert strikes, "the outputs never moved"
-    strikes[0].join()
+    for strike in strikes:
+        strike.join()
     if any(hold["class"] == CauseClass.HOST for hold in outcome["holds"]):
         pytest.skip(f"this host stood still: {outcome['holds'][0]['cause']}")
+    assert strikes, f"the outputs never moved: {outcome['safe_state']}, {outcome['ticks']}"
     assert truth is not None
     return outcome, truth
 
