@@ -160,41 +160,35 @@ MISALIGNMENT = Effect(
 
 # -- soft iron --------------------------------------------------------------------------------------
 
-_CROSS = tuple((i, j) for i in "xyz" for j in "xyz" if i != j)
-
 
 def _iron_parts(settings: Settings) -> Parts:
-    return Parts((), tuple(Parameter(f"{i}{j}", "{out}/{in}", scale=0.01) for i, j in _CROSS), 0.02 * np.eye(6))
+    return Parts((), tuple(Parameter(i + j, "{out}/{in}", scale=0.01) for i, j in _PAIRS), 0.02 * np.eye(3))
 
 
 def _iron_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    vector = vector_of(ctx.signals)
-    out = np.zeros((ctx.t.size, 6))
-    for c, (i, j) in enumerate(_CROSS):
-        if i == own_axis(ctx.output) and j in vector:
-            out[:, c] = ctx.signals[vector[j]]
+    vector, own = vector_of(ctx.signals), own_axis(ctx.output)
+    out = np.zeros((ctx.t.size, 3))
+    for c, pair in enumerate(_PAIRS):
+        if own in pair and (other := pair[pair[0] == own]) in vector:
+            out[:, c] = ctx.signals[vector[other]]
     return out
 
 
 def _iron_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
-    out = [Human(f"{i}{j}", float(v) / g, "1") for (i, j), v in zip(_CROSS, p, strict=True)]
-    at = dict(zip(_CROSS, p, strict=True))
-    even = sum((at[i, j] + at[j, i]) ** 2 for i, j in _PAIRS) / 2
-    total = float(np.sum(p**2))
-    out.append(Human("symmetric_share", float(even / total) if total > 0 else 1.0, "1"))
-    return out
+    return [Human(i + j, float(v) / g, "1") for (i, j), v in zip(_PAIRS, p, strict=True)]
 
 
 SOFT_IRON = Effect(
     name="soft_iron",
-    summary="linear distortion of a field vector (off-diagonal or unequal gains)",
+    summary="field of magnetised iron nearby, symmetric in the axes",
     kind="add",
     stages=("environment",),
     parts=_iron_parts,
-    equation=r"B' = (I + S)\,B",
+    equation=r"B' = (I + S)\,B, \quad S = S^T",
     source="M. J. Caruso, Applications of Magnetic Sensors for Low Cost Compass Systems, IEEE PLANS 2000;"
-    " V. Renaudin et al., J. Sensors 2010, eq. 6",
+    " V. Renaudin et al., J. Sensors 2010, eq. 6; symmetric as the polarizability is (L. D. Landau, E. M. Lifshitz,"
+    " Electrodynamics of Continuous Media, sec. 2)",
     excitation="the instrument turned through all directions",
     confusable_with=("misalignment",),
     basis=_iron_basis,
@@ -204,7 +198,7 @@ SOFT_IRON = Effect(
     shared=True,
     twins=("magnetometer",),
     available=_available,
-    vanishes_with=(("x?", "y?", "z?"),),
+    vanishes_with=(("x?", "y?"),),
 )
 
 # -- quadratic cross-axis bias ----------------------------------------------------------------------

@@ -277,6 +277,11 @@ class Effect:
         return self.kind == "linear" or self.proportional
 
     @property
+    def is_independent(self) -> bool:
+        """True if the course depends on no signal of the recording: drifts, steps, walks, lines."""
+        return not self.driven and not self.needs and self.available is None
+
+    @property
     def form(self) -> tuple[str, str, str]:
         """Return the key that distinguishes one shape of an effect from another: (name, kind, equation)."""
         return self.name, self.kind, self.equation

@@ -369,7 +369,7 @@ def _scale_variation(s: Slot, x: str, d: str) -> str:
 
 def _soft_iron(s: Slot, x: str, d: str) -> str:
     own = s.output[-1]
-    return x + "".join(f" + {s.at(own + a)} * {v}" for a, v in _axes(s).items() if a != own)
+    return x + "".join(f" + {s.at(min(own, a) + max(own, a))} * {v}" for a, v in _axes(s).items() if a != own)
 
 
 def _centripetal(s: Slot, x: str, d: str) -> str:

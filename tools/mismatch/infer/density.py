@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +139,54 @@ def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
     return e - past @ np.linalg.lstsq(past[learned], clipped[learned], rcond=None)[0]
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """Measures the log likelihood of the fitted samples ``learned`` (m,) of an output, one step ahead.
+
+    ``least`` is the least scale of a residual, ``price`` the nats of one parameter (Schwarz 1978).
+    """
+
+    learned: NDArray[np.bool_] = field(repr=False)
+    least: float
+    price: float
+
+    @staticmethod
+    def of(problem: Problem, fitted: Fit, output: str) -> Evidence:
+        """Return the evidence on the samples of ``output`` that are no events of ``fitted``."""
+        learned = np.zeros(problem.index.size, np.bool_)
+        learned[problem.fit_rows] = True
+        learned &= ~fitted.model.excused(problem.view, output)
+        price = 0.5 * math.log(max(int(np.count_nonzero(learned)), 2))
+        return Evidence(learned, NORMAL_SCALE * problem.sigma(output), price)
+
+    def nats(self, e: Array, deviation: Array | float = 1.0) -> float:
+        """Return the log likelihood of the prediction errors ``e`` (m,) with standard deviations ``deviation``."""
+        e_in = e[self.learned]
+        d = student_log_density(e_in, student_scale(e_in, self.least))
+        return float(np.sum(d - np.log(np.broadcast_to(deviation, e.shape)[self.learned])))
+
+    def one_step(self, problem: Problem, fitted: Fit, output: str) -> float:
+        """Return the log likelihood of ``fitted``, whose errors are white or coloured, whichever is likelier."""
+        error, deviation = prediction(problem, fitted, output)
+        e = error / deviation
+        return max(self.nats(e, deviation), self.nats(innovations(e, self.learned), deviation))
+
+
+def walks(fitted: Fit, output: str) -> list[int]:
+    """Return the places in a set of the effects on ``output`` that are noise with a law of their own."""
+    return [k for k, p in enumerate(fitted.model.placed) if p.effect.predict is not None and output in p.outputs]
+
+
+def priced_likelihood(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed, Fit], float]) -> float:
+    """Return the log likelihood of ``output`` one step ahead, less the price of its effects (Schwarz 1978).
+
+    The rest is white or coloured, whichever is likelier. ``figures`` returns the number of parameters of an effect.
+    """
+    evidence = Evidence.of(problem, fitted, output)
+    size = sum(figures(p, fitted) for p in fitted.model.placed if output in p.outputs)
+    return evidence.one_step(problem, fitted, output) - evidence.price * size
+
+
 def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed, Fit], float]) -> bool:
     """Return True if a curve of a recorded signal explains ``output`` better than its signal-independent effects.
 
@@ -148,23 +196,13 @@ def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Plac
     own = [
         k
         for k, p in enumerate(fitted.model.placed)
-        if output in p.outputs and not p.effect.driven and not p.effect.needs and p.effect.claims is None
+        if output in p.outputs and p.effect.is_independent and p.effect.claims is None
     ]
     if not own:
         return False
-    learned = np.zeros(problem.index.size, np.bool_)
-    learned[problem.fit_rows] = True
-    learned &= ~fitted.model.excused(problem.view, output)
-    least = NORMAL_SCALE * problem.sigma(output)
-    one = 0.5 * math.log(max(int(np.count_nonzero(learned)), 2))
-
-    def nats(e: Array, deviation: Array | float = 1.0) -> float:
-        d = student_log_density(e[learned], student_scale(e[learned], least))
-        return float(np.sum(d - np.log(np.broadcast_to(deviation, e.shape)[learned])))
-
-    error, deviation = prediction(problem, fitted, output)
-    e = error / deviation
-    with_it = max(nats(e, deviation), nats(innovations(e, learned), deviation))
+    evidence = Evidence.of(problem, fitted, output)
+    learned, nats, one = evidence.learned, evidence.nats, evidence.price
+    with_it = evidence.one_step(problem, fitted, output)
     with_it -= one * sum(figures(fitted.model.placed[k], fitted) for k in own)
     r = undone(problem, fitted, output, own)
     bare = max(with_it, nats(innovations(r - np.median(r[learned]), learned)))

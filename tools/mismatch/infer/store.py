@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,7 +24,9 @@ from tools.mismatch.infer.density import (
     exact_log_density,
     follower,
     gain_of_events,
+    priced_likelihood,
     unpredicted,
+    walks,
     weigh,
 )
 from tools.mismatch.placed import Placed
@@ -86,6 +88,7 @@ class Store:
         self.seen: dict[Part, Candidate] = {}
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
+        self._ahead: dict[tuple[Key, str], float] = {}
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
         self.outputs = float(len(problem.twin.outputs))
@@ -101,6 +104,7 @@ class Store:
         self.problem = quieter
         self._best, self._exact = best_log_density(quieter), exact_log_density(quieter)
         self._tests.clear()
+        self._ahead.clear()
         for key, old in self.sets.items():
             # the weight of a law of noise depends on the floor
             if any(p.effect.predict is not None for p in old.placed):
@@ -112,7 +116,9 @@ class Store:
         old = self.sets.get(scored.key)
         if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
             self.sets[scored.key] = scored
-            self._tests = {of: z for of, z in self._tests.items() if of[0] != scored.key}
+            for known in (self._tests, self._ahead):
+                for of in [of for of in known if of[0] == scored.key]:
+                    del known[of]
         return self.sets[scored.key]
 
     def scored(self, fitted: Fit) -> Scored:
@@ -156,12 +162,38 @@ class Store:
         return {o: self._best[o] - d for o, d in s.density.items()}
 
     def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
-        """Return the proper sets, the best of each set of names, best first."""
+        """Return the proper sets, the best of each set of names, best first, without walks that are outdone."""
         best: dict[frozenset[str], Scored] = {}
         for s in self.sets.values() if sets is None else sets:
             if s.proper and (s.names not in best or self.score(s) > self.score(best[s.names])):
                 best[s.names] = s
-        return sorted(best.values(), key=lambda s: (-self.score(s), sorted(s.names)))
+        left = [s for s in best.values() if not self.outdone(s, best.values())]
+        return sorted(left, key=lambda s: (-self.score(s), sorted(s.names)))
+
+    def ahead(self, s: Scored, output: str) -> float:
+        """Return the log likelihood of ``output`` one step ahead, less prices (``density.priced_likelihood``)."""
+        if (s.key, output) not in self._ahead:
+            self._ahead[s.key, output] = priced_likelihood(self.problem, s.fitted, output, figures_of)
+        return self._ahead[s.key, output]
+
+    def outdone(self, s: Scored, others: Iterable[Scored]) -> bool:
+        """Return True if one of ``others`` that follows signals alone, with no more names, predicts the outputs with
+        walks of ``s`` better one step ahead.
+
+        A walk predicts each sample from those before it and a free run does not, so that any slow error of form would
+        look better as a walk. Here the rest of either is coloured noise, as that of the smaller sets is which the walk
+        stands beside. A course in time is no rival, because it may be fitted to a course of the walk.
+        """
+        outputs = [o for o in self.problem.twin.outputs if walks(s.fitted, o)]
+        if not outputs:
+            return False
+
+        def worth(x: Scored) -> float:
+            return sum(self.ahead(x, o) for o in outputs) - self.constants.per_name * len(x.names)
+
+        free = [d for d in others if not any(p.effect.is_independent for p in d.placed)]
+        own = max(worth(x) for x in (s, self.base, *(d for d in free if d.names < s.names)))
+        return any(worth(d) > own for d in free if len(d.names) <= len(s.names))
 
     def room(self, s: Scored) -> dict[str, float]:
         """Return the most nats per output by which a larger set can be better.

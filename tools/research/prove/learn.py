@@ -86,14 +86,15 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         leaves[s.key] = worst_left(store.problem, store.base.fitted, rest, doubt=bool(eventful.placed))
         events[s.key] = store.eventful[s.key][1]
     strange = free_curve(store.problem, store.base.fitted, candidate_signals(inferred.found.first))
-    kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
+    names = {s.names for s in ranked}
+    kept = sorted((s for s in store.sets.values() if s.proper and s.names in names), key=lambda s: -store.score(s))
     return {
         "held": int(store.problem.held_rows.size),
         "outputs": store.outputs,
         "sets": [
             {"names": sorted(s.names), "short": [*store.short(s).values()], "parameters": s.parameters,
              "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
-            for s in [*kept, *([] if store.base in kept else [store.base])]
+            for s in [*kept[:SETS], *([] if store.base in kept[:SETS] else [store.base])]
         ],
         "strange": None if strange is None else {
             "share": strange.share,
