@@ -134,7 +134,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def _has_false_name(row: dict[str, Any]) -> bool:
     expected = 1 if row["grouped"] else 0
-    return len(row["names"]) > expected
+    return len(set(row["names"])) > expected
 
 
 def page(rows: Sequence[dict[str, Any]], samples: int) -> str:
