@@ -203,7 +203,7 @@ def rows() -> Iterator[Row]:
 
 
 def polled_rows(setup: Setup, polled: Bare, bare: Bare) -> Iterator[Row]:
-    """What the emulated world, one process in Python, is late for because it serves the slow converters, too."""
+    """Yield how late the emulated world, one process in Python, is because it serves the slow converters, too."""
     for name, share, _ in GOALS:
         ours, peer = (float(np.percentile(each.late_us, share)) for each in (polled, bare))
         yield Row(

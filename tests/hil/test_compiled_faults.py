@@ -47,7 +47,7 @@ def faults_of_world() -> list[Fault]:
 OF_OTHER_OUTPUTS = (
     ("micron-e727", Fault("line: unplugged", InWorld("unplug", "e7270"), "safe state", ("piezo",))),
     ("micron-e727", Fault("line: E-727 does not answer", InWorld("freeze", "piezo"), "safe state", ("piezo",))),
-    ("micron-can", Fault("can: node does not answer", InWorld("freeze", "piezo"), "safe state", ("piezo",))),
+    ("micron-can", Fault("can: node does not answer", InWorld("silence", "piezo"), "safe state", ("piezo",))),
 )
 
 

@@ -183,8 +183,8 @@ def test_a_walk_is_no_account_of_what_follows_a_recorded_signal(follows: str) ->
 
 @pytest.mark.parametrize("follows", [True, False])
 def test_a_walk_is_no_account_of_what_a_signal_explains_one_step_ahead(follows: bool) -> None:
-    """What follows the input with three time constants is no creep of one, and the error of form is slow. A walk that
-    is there is kept, beside the same rivals."""
+    """An output that follows the input with three time constants has no creep of one, and the error of form is slow. A
+    walk that is there is kept, beside the same rivals."""
     rng = np.random.default_rng(0)
     u = 40.0 * wave(rng, N)
     slow = sum(lfilter([1.0 / tau], [1.0, 1.0 / tau - 1.0], u) for tau in (20.0, 150.0, 1200.0))

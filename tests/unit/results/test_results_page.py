@@ -43,6 +43,14 @@ def test_the_results_page_is_up_to_date():
     )
 
 
+def test_no_table_of_the_results_page_is_empty():
+    """Criteria are no published figures: a table of both kinds once lost all its rows."""
+    lines = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").splitlines()
+    heads = [n for n, line in enumerate(lines) if line.startswith("|---")]
+    assert heads
+    assert all(n + 1 < len(lines) and lines[n + 1].startswith("|") for n in heads)
+
+
 def test_the_table_of_healed_benches_is_that_of_its_artefact():
     text = (ROOT / "docs" / "circle.md").read_text(encoding="utf-8")
     assert insert(text, load(FOLDER / "heal.json")) == text, (

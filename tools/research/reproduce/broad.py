@@ -39,7 +39,7 @@ NOTES = (
     "0.55. A gyroscope's bias that walks with each turn: 1.36 to 1.94, 0.53 to 0.76. A magnet on the body as a filter "
     "without a rival model: 1.61, 0.56.",
 )
-"""What a reader of the rows must know of goals that are missed."""
+"""Notes under the rows: why goals are missed, and what was tried."""
 CHOSEN = {"heading_density": 2, "turn_per_rate": 2, "disturbance_rad": 1}
 """Fields of the filter that are chosen, with the power of the noise's amplitude that they are."""
 FACTORS = (2.0, 10.0**0.5)

@@ -49,7 +49,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-false-alarms": (),
     "mismatch-foreign": (),
     "mismatch-measured": (),
-    "mismatch-gate": ("First run", "The same cases again"),
+    "mismatch-gate": ("First run", "Weights that share", "Sealed corpus, walks"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
     "together": ("Not named",),
@@ -108,7 +108,7 @@ def _content(section: dict[str, Any]) -> list[str]:
 
 def _misses(section: dict[str, Any]) -> list[str]:
     """Return the notes of a table of published figures, and its rows that are not met with the reason of each."""
-    tables = [b for b in section["content"] if b.get("columns", [""])[-1] == "met"]
+    tables = [b for b in section["content"] if b.get("columns", [""])[-1] == "met" and "published" in b["columns"]]
     if not tables:
         return []
     lists = [item for b in section["content"] for item in b.get("list", [])]
