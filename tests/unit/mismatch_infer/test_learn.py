@@ -101,6 +101,16 @@ def test_cross_validation_counts_every_case_once() -> None:
     figures = cross_validated(cases, lambda some: START)
     assert figures.cases == len(figures.stated) == 20
     assert figures.exactly_right == sum(c.right(START) for c in cases)
+    # in the order of the cases, because the caller excludes names by the kind of their case
+    assert [list(of) for of in figures.stated] == [list(raw_surenesses(START, [c])) for c in cases]
+
+
+def test_a_name_that_would_be_withheld_teaches_nothing() -> None:
+    sets = (_set("", 0.0, 0), _set("a", 1.0, 2), _set("ab", 1.15, 4))
+    case = Case("c", "single", frozenset("a"), 900, sets, None)
+    names = list(raw_surenesses(START, [case]))
+    assert case.says(START)[1].names == frozenset("ab")
+    assert [(n.right, n.whole) for n in names] == [(True, True)]
 
 
 def test_what_is_learned_from_decides_as_the_engine_does() -> None:

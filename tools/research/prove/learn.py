@@ -18,6 +18,7 @@ from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.decide import (
     CURVE,
     candidate_signals,
+    dispensable,
     free_curve,
     is_whole,
     log_odds,
@@ -274,7 +275,10 @@ def learn_sure(c: Constants, stated_names: Sequence[StatedName]) -> Constants:
 
 
 def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
-    """Every name that would be reported, with its probability before the map."""
+    """Every name that would be reported, with its probability before the map.
+
+    Of an account that is not whole the map decides which are, and it is not known yet: all of them count.
+    """
     c = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
     for case in cases:
         verdict, chosen = case.says(c)
@@ -282,7 +286,10 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
         sets = [(s.names, case.score(s, c)) for s in case.accepted(c)]
         sure = surenesses(chosen.names, sets, whole, c)
         sure |= {n: stated(1.0 - chosen.events[n], whole, c) for n in chosen.with_events(c) - chosen.names}
+        withheld = dispensable(chosen.names, sets, whole, c) if whole else frozenset[str]()
         for name, p in sure.items():
+            if name in withheld:
+                continue
             yield StatedName(p, name in case.names, whole)
 
 
@@ -301,11 +308,13 @@ class CrossValidated:
 
 def cross_validated(cases: Sequence[Case], learner: Callable[[Sequence[Case]], Constants] = learn) -> CrossValidated:
     """The learner on cases that it has not seen."""
-    right, values, stated_names = 0, list[float](), list[Sequence[StatedName]]()
+    right, values = 0, list[float]()
+    stated_names: list[Sequence[StatedName]] = [()] * len(cases)
     for fold in range(FOLDS):
-        held = [c for i, c in enumerate(cases) if i % FOLDS == fold]
         constants = learner([c for i, c in enumerate(cases) if i % FOLDS != fold])
-        right += sum(c.right(constants) for c in held)
-        values += [c.log_probability(constants) for c in held if c.kind != "unknown"]
-        stated_names += [list(raw_surenesses(constants, [c])) for c in held]
+        for i, c in enumerate(cases):
+            if i % FOLDS == fold:
+                right += c.right(constants)
+                values += [c.log_probability(constants)] if c.kind != "unknown" else []
+                stated_names[i] = list(raw_surenesses(constants, [c]))
     return CrossValidated(len(cases), right, float(np.mean(values)) if values else 0.0, stated_names)
