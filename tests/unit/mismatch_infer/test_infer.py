@@ -114,6 +114,9 @@ def test_a_name_that_may_be_one_too_many_is_told_from_one_of_two_equals() -> Non
     assert dispensable(frozenset("ab"), [(of, v - 4.0 * (of != frozenset("ab"))) for of, v in extra], True, c) == set()
     either = [(frozenset("ab"), 0.0), (frozenset("a"), -0.2), (frozenset("b"), -0.3), (frozenset(), -60.0)]
     assert dispensable(frozenset("ab"), either, False, c) == {"b"}
+    # two others in the place of one say as well that the rest is too few
+    two = [(frozenset("ab"), 0.0), (frozenset("acd"), -0.2), (frozenset("a"), -30.0), (frozenset(), -60.0)]
+    assert dispensable(frozenset("ab"), two, True, c) == set()
 
 
 def test_the_form_of_what_is_named_may_leave_its_share() -> None:

@@ -91,7 +91,7 @@ def test_boastful_probabilities_are_lowered_on_cases_of_their_own() -> None:
         cases.append(Case(f"c{i}", "single", frozenset(true), 900, sets, None))
     before = np.mean([n.sure for n in raw_surenesses(START, cases)])
     c = learn_sure(START, list(raw_surenesses(START, cases[:150])))
-    after = np.mean([stated(n.sure, n.whole, c) for n in raw_surenesses(START, cases[150:])])
+    after = np.mean([stated(n.sure, n.known, c) for n in raw_surenesses(START, cases[150:])])
     assert before > 0.97
     assert after == pytest.approx(0.75, abs=0.06)
 
@@ -110,7 +110,7 @@ def test_a_name_that_would_be_withheld_teaches_nothing() -> None:
     case = Case("c", "single", frozenset("a"), 900, sets, None)
     names = list(raw_surenesses(START, [case]))
     assert case.says(START)[1].names == frozenset("ab")
-    assert [(n.right, n.whole) for n in names] == [(True, True)]
+    assert [(n.right, n.known) for n in names] == [(True, True)]
 
 
 def test_what_is_learned_from_decides_as_the_engine_does() -> None:
@@ -167,5 +167,5 @@ def test_names_beside_something_unexplained_are_stated_as_seldom_as_they_are_rig
     c = learn_sure(START, list(raw_surenesses(START, cases[:100])))
     names = list(raw_surenesses(START, cases[100:]))
     for whole, share in ((True, 0.95), (False, 0.4)):
-        said = [stated(n.sure, n.whole, c) for n in names if n.whole == whole]
+        said = [stated(n.sure, n.known, c) for n in names if n.known == whole]
         assert np.mean(said) == pytest.approx(share, abs=0.12)

@@ -97,15 +97,15 @@ def accepted(store: Store, gone: Sequence[Out] = ()) -> list[Scored]:
 
 
 def surenesses(
-    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
+    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], known: bool, c: Constants
 ) -> dict[str, float]:
     """Return the probability of each of ``names`` among ``sets`` (names, score).
 
     It is the tempered posterior of the sets that have the name, mapped on a log odds scale that was calibrated on
-    separate cases. ``whole``: nothing more is left.
+    separate cases. ``known``: only noise is left.
     """
     weights = posterior(sets)
-    return {name: stated(sum(w for of, w in weights if name in of), whole, c) for name in names}
+    return {name: stated(sum(w for of, w in weights if name in of), known, c) for name in names}
 
 
 def posterior(sets: Sequence[tuple[frozenset[str], float]]) -> list[tuple[frozenset[str], float]]:
@@ -121,32 +121,32 @@ LIKELY = 0.9
 were right that had 0.5 to 0.9, and 9 of 10 from there to 0.999."""
 
 
-def is_likely(p: float, whole: bool, c: Constants) -> bool:
+def is_likely(p: float, known: bool, c: Constants) -> bool:
     """Return True if a name of posterior probability ``p`` is to be reported.
 
     Beside an unexplained rest its probability must be stated to be at least a half.
     """
-    return p >= LIKELY if whole else stated(p, False, c) >= 0.5
+    return p >= LIKELY if known else stated(p, False, c) >= 0.5
 
 
 def dispensable(
-    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
+    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], known: bool, c: Constants
 ) -> frozenset[str]:
     """Return those of ``names`` that may well be one too many, the weakest first: of two that stand for each other one
     is needed.
 
-    A name has the support of the sets that have it, or another in its place: which of two equals it is, is a question
+    A name has the support of the sets that have it, or others in its place: which of two equals it is, is a question
     of its own (``Answer.rivals``).
     """
     weights, kept = posterior(sets), names
 
     def support(name: str) -> float:
         rest = kept - {name}
-        return sum(w for of, w in weights if name in of or (rest <= of and len(of) == len(kept)))
+        return sum(w for of, w in weights if name in of or rest < of)
 
     while kept:
         weakest = min(sorted(kept), key=support)
-        if is_likely(support(weakest), whole, c):
+        if is_likely(support(weakest), known, c):
             break
         kept -= {weakest}
     return names - kept
@@ -161,13 +161,13 @@ def log_odds(p: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-def stated(p: float, whole: bool, c: Constants) -> float:
+def stated(p: float, known: bool, c: Constants) -> float:
     """Map a raw probability to the stated one.
 
-    The raw one compares known effects only. If the account is not ``whole``, an unknown effect may have been mistaken
-    for the name, and the stated probability is lower.
+    The raw one compares known effects only. If not all of the residual is ``known``, an unknown effect may have been
+    mistaken for the name, and the stated probability is lower.
     """
-    odds = c.sure_offset + c.sure_slope * log_odds(p) - (0.0 if whole else c.sure_open)
+    odds = c.sure_offset + c.sure_slope * log_odds(p) - (0.0 if known else c.sure_open)
     return min(1.0 / (1.0 + math.exp(-odds)), c.most_sure)
 
 
@@ -316,7 +316,7 @@ class Judged:
     """Holds ``final``, a set with the events beside it, its ``rest``, and if that is an account (``whole``).
 
     ``doubtful`` lists the outputs whose noise decides this; ``known`` is True if it is an account however loud the
-    noise is.
+    noise is, and not only because errors of form are forgiven their share: that rest may be other physics.
     """
 
     final: Scored
@@ -333,11 +333,12 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
     if events is not None and any(name not in events for name in final.names - chosen.names):
         final = store.without(final, lambda e: e.effect.claims is not None and e.effect.name not in events)
     rest = rest_of(p, final.fitted)
-    quiet, loud = (is_whole(*worst_left(p, store.base.fitted, rest, doubt=doubt), c) for doubt in (False, True))
+    left, most_left = (worst_left(p, store.base.fitted, rest, doubt=doubt) for doubt in (False, True))
+    quiet, loud = is_whole(*left, c), is_whole(*most_left, c)
     # without a named effect the noise as estimated decides, so that the doubt is reported
     whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
-    return Judged(final, rest, whole, doubtful, whole and quiet)
+    return Judged(final, rest, whole, doubtful, whole and quiet and most_left[0] <= c.cut)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import FLOW
 from tools.guest.equations import Program
+from tools.mismatch.twins.affine import is_affine
 from tools.mismatch.twins.feedback import Rows
 from tools.mismatch.twins.ode_run import SWAY, Drive, Packed, rates_of, run_equations, run_readings
 
@@ -77,6 +78,11 @@ NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((
 class Equations(Protocol):
     """Defines the derivatives and outputs of a model, independent of how they are computed."""
 
+    @property
+    def affine(self) -> bool:
+        """Return True if the derivatives are affine in states and signals and do not depend on time."""
+        ...
+
     def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
         """Return the states (n, s) of a free run; ``values`` are the parameters, ``limits`` those of each state."""
         ...
@@ -98,6 +104,11 @@ class Programs:
     outputs: Program
     at: int
     """Index of the register of the first parameter."""
+
+    @cached_property
+    def affine(self) -> bool:
+        """See Equations."""
+        return is_affine(self.rates_program, self.at - 1)
 
     def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
         """See Equations."""

@@ -15,6 +15,7 @@ from sim_devices.physics.forces import FLOW, UNCENTRED
 from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
+from tools.mismatch.twins.affine import Steps, exact_steps
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.equations import (
@@ -279,8 +280,11 @@ class OdeTwin(Head):
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
 
         held = np.full(len(self.signals), self.held)
+        steps = self.exact_steps(run.dt, values) if not forces and self.equations.affine and self.unlimited else None
 
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
+            if steps is not None:
+                return steps.run(x0, u, first, stop)
             drive = Drive(u, held, t, run.dt, sub, first, stop)
             return self.equations.states(x0, drive, values, inside, limits)
 
@@ -334,12 +338,30 @@ class OdeTwin(Head):
             every[used] = some
             return every
 
+        tried: list[tuple[Array, Array]] = []
+        part, t = u[seen], run.t[seen]
+
         def misses_all(some: Array) -> Array:
             x = go(with_some(some), starts, ends, u, run.t)
-            return (y - self.equations.readings(x[seen], u[seen], run.t[seen], values)) * weight
+            tried.append((some, x))
+            return (y - self.equations.readings(x[seen], part, t, values)) * weight
 
         found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
-        return go(with_some(found), starts, ends, u, run.t)
+        # each stretch starts anew, and has been run from the state that was found
+        out = tried[0][1].copy()
+        for k, i in enumerate(used):
+            x = next(x for some, x in tried if np.array_equal(some[k], found[k], equal_nan=True))
+            out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
+        return out
+
+    @cached_property
+    def unlimited(self) -> bool:
+        """Return True if no state has limits."""
+        return all(s.lowest == -np.inf and s.highest == np.inf for s in self.state_list)
+
+    def exact_steps(self, dt: float, values: Array) -> Steps:
+        """Return the steps of affine equations for these numbers."""
+        return exact_steps(lambda x, u: self.equations.rates(x, u, values), self.typical, self.middle[1], dt, self.held)
 
     def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array) -> Array:
         """Move states (k, s) as little as possible so that the outputs (k, q) equal the measurement.

@@ -93,10 +93,10 @@ def beside(answer: Mapping[str, Any]) -> list[str]:
 def stated_names(case: Case, names: Sequence[StatedName]) -> list[StatedName]:
     """Return the names of a case that the map of "sure" is learned on.
 
-    In a whole account the probability is that of a name among the vocabulary: no data tell a stand-in for physics
-    without a name that leaves only noise. An account that is not whole has such physics beside its names.
+    Where only noise is left the probability is that of a name among the vocabulary: no data tell a stand-in for physics
+    without a name. A rest that is not noise may be such physics.
     """
-    return [n for n in names if case.kind != "beside" or not n.whole]
+    return [n for n in names if case.kind != "beside" or not n.known]
 
 
 def vocabulary_without(name: str) -> list[Effect]:
@@ -161,7 +161,7 @@ def calibrate(
 def _left_out(constants: Constants, names: Sequence[Sequence[StatedName]], k: int) -> list[tuple[float, float]]:
     """Names of case ``k`` with the map of "sure" that the others give."""
     others = learn_sure(constants, [n for i, of in enumerate(names) if i != k for n in of])
-    return [(stated(n.sure, n.whole, others), float(n.right)) for n in names[k]]
+    return [(stated(n.sure, n.known, others), float(n.right)) for n in names[k]]
 
 
 def cases_of(number: int, row: dict[str, Any]) -> list[Case]:

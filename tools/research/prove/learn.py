@@ -244,22 +244,22 @@ def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequenc
 
 
 class StatedName(NamedTuple):
-    """A name of a report: its raw probability, whether it is right, and whether the account is whole."""
+    """A name of a report: its raw probability, whether it is right, and whether the rest is noise (``Judged.known``)."""
 
     sure: float
     right: bool
-    whole: bool
+    known: bool
 
 
 def learn_sure(c: Constants, stated_names: Sequence[StatedName]) -> Constants:
     """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases that the constants
     were not learned on, held weakly at the identity; and the most that is stated, by the rule of succession (Laplace
-    1774) over the sure ones of whole accounts: so many cases cannot vouch for more."""
+    1774) over the sure ones beside noise alone: so many cases cannot vouch for more."""
     if not stated_names:
         return c
     x = np.array([log_odds(n.sure) for n in stated_names])
     right = np.array([float(n.right) for n in stated_names])
-    is_open = np.array([float(not n.whole) for n in stated_names])
+    is_open = np.array([float(not n.known) for n in stated_names])
 
     def loss(v: np.ndarray) -> float:
         z = v[0] + np.exp(v[1]) * x - v[2] * is_open
@@ -277,20 +277,20 @@ def learn_sure(c: Constants, stated_names: Sequence[StatedName]) -> Constants:
 def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
     """Every name that would be reported, with its probability before the map.
 
-    Of an account that is not whole the map decides which are, and it is not known yet: all of them count.
+    Where the rest is not noise the map decides which are, and the map is not learned yet: all of them count.
     """
     c = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
     for case in cases:
         verdict, chosen = case.says(c)
-        whole = verdict != "unexplained"
+        known = verdict != "unexplained" and (chosen.rest or 0.0) <= c.cut
         sets = [(s.names, case.score(s, c)) for s in case.accepted(c)]
-        sure = surenesses(chosen.names, sets, whole, c)
-        sure |= {n: stated(1.0 - chosen.events[n], whole, c) for n in chosen.with_events(c) - chosen.names}
-        withheld = dispensable(chosen.names, sets, whole, c) if whole else frozenset[str]()
+        sure = surenesses(chosen.names, sets, known, c)
+        sure |= {n: stated(1.0 - chosen.events[n], known, c) for n in chosen.with_events(c) - chosen.names}
+        withheld = dispensable(chosen.names, sets, known, c) if known else frozenset[str]()
         for name, p in sure.items():
             if name in withheld:
                 continue
-            yield StatedName(p, name in case.names, whole)
+            yield StatedName(p, name in case.names, known)
 
 
 @dataclass(frozen=True)
