@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import expm
+
 from tools.guest.equations import Builder
 from tools.mismatch.twins.affine import exact_steps, is_affine
 from tools.mismatch.twins.program import parse

@@ -20,8 +20,8 @@ class Constants:
     a form error (``Count``); ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out
     correlation of every name. ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left and
     follow signals before the account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a
-    name to stated ones, less ``sure_open`` where more than ``cut`` is left; ``most_sure``: the probability that is stated at
-    most, by how many cases the map was learned on.
+    name to stated ones, less ``sure_open`` where more than ``cut`` is left; ``most_sure``: the probability that is
+    stated at most, by how many cases the map was learned on.
     """
 
     samples: float

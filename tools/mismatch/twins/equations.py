@@ -105,7 +105,7 @@ class Programs:
     at: int
     """Index of the register of the first parameter."""
 
-    @cached_property
+    @property
     def affine(self) -> bool:
         """See Equations."""
         return is_affine(self.rates_program, self.at - 1)

@@ -280,7 +280,7 @@ class OdeTwin(Head):
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
 
         held = np.full(len(self.signals), self.held)
-        steps = self.exact_steps(run.dt, values) if not forces and self.equations.affine and self.unlimited else None
+        steps = self.exact_steps(run.dt, values) if self.has_exact_steps and not forces else None
 
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
             if steps is not None:
@@ -355,9 +355,9 @@ class OdeTwin(Head):
         return out
 
     @cached_property
-    def unlimited(self) -> bool:
-        """Return True if no state has limits."""
-        return all(s.lowest == -np.inf and s.highest == np.inf for s in self.state_list)
+    def has_exact_steps(self) -> bool:
+        """Return True if the equations without forces are affine and no state has limits."""
+        return self.equations.affine and all(s.lowest == -np.inf and s.highest == np.inf for s in self.state_list)
 
     def exact_steps(self, dt: float, values: Array) -> Steps:
         """Return the steps of affine equations for these numbers."""

@@ -244,7 +244,7 @@ def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequenc
 
 
 class StatedName(NamedTuple):
-    """A name of a report: its raw probability, whether it is right, and whether the rest is noise (``Judged.known``)."""
+    """A name of a report: its raw probability, if it is right, and if the rest is noise (``Judged.known``)."""
 
     sure: float
     right: bool
