@@ -342,7 +342,6 @@ class Model:
         """
         found, change = dict(outputs), dict[str, Array]()
         inside = inside_of(self.twin)
-        afresh = inside is not None and inside.integrates
         for k in self.order:
             pl = self.placed[k]
             if pl.site != "output":
@@ -354,8 +353,10 @@ class Model:
                 by = inputs[drive] if self.twin.static and drive else None
                 was = found[o]
                 now = self._pass(run, k, was, by, o, how)
+                # with weights the outputs of a linear twin would be affine in them no more
+                afresh = inside.integrates if inside is not None else self.twin.restart and not pl.parts.weights
                 if afresh and pl.effect.driven:
-                    # the start states depend on its weights
+                    # the start states depend on it
                     if how.folded is not None:
                         how.folded.update(now.columns)
                     now = fold(now, how.theta)
