@@ -82,11 +82,23 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
 
 
 def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequence[Array], given: Array) -> list[Array]:
-    """Return the starts on the engineer's base with weights fitted again there; ``rest`` is without effect ``k``."""
+    """Return the starts on the engineer's base with weights fitted again there; ``rest`` is without effect ``k``.
+
+    They are the guesses ``found``, and the first two from the residual there: a base that has slowed down to imitate a
+    delay shows too short a delay.
+    """
     pl = model.placed[k]
     a, b = model.slices(k)
     out: list[Array] = []
-    for th in found:
+    believed = found[0].copy()
+    believed[: model.n_base] = given
+    without = rest.carry(model, believed, view.recording)
+    x, ctx = probe_signals(rest, view, without, pl, pl.outputs[0])
+    guesses = pl.effect.guess(x, full_residual(rest, view, without, pl.outputs[0]), ctx, pl.settings)
+    there = [believed.copy() for _ in guesses[:2]]
+    for th, q in zip(there, guesses, strict=False):
+        th[a] = q
+    for th in (*found, *there):
         other = th.copy()
         other[: model.n_base] = given
         if b.stop > b.start and b.start not in model.linear:
