@@ -11,6 +11,8 @@ import pytest
 from tools.errors import RecordingError
 from tools.mismatch.guess import POINTS, guess, main
 from tools.mismatch.guess_roles import guess_role, split_unit
+from tools.mismatch.new import new_recording
+from tools.mismatch.recording_load import load
 
 
 @pytest.mark.parametrize(
@@ -19,6 +21,8 @@ from tools.mismatch.guess_roles import guess_role, split_unit
         ("force_N", ("force", "N")), ("x [mm]", ("x", "mm")), ("speed (m/s)", ("speed", "m/s")), ("t_s", ("t", "s")),
         ("gyro_deg/s", ("gyro", "deg/s")), ("accel_1", ("accel_1", "")), ("plain", ("plain", "")),
         ("sensor_left", ("sensor_left", "")), ("T/degC", ("T", "degC")),
+        ("speed_rad_s", ("speed", "rad/s")), ("a_m_s2", ("a", "m/s2")), ("sun_W_m2", ("sun", "W/m2")),
+        ("wheel_l", ("wheel_l", "")), ("tank_ml", ("tank", "ml")), ("speed_in_s", ("speed_in", "s")),
     ],
 )  # fmt: skip
 def test_units_are_read_from_names(name: str, parts: tuple[str, str]):
@@ -55,6 +59,38 @@ def test_a_motor_axis(tmp_path: Path):
     assert len(x.low) == POINTS
     assert min(x.low) == pytest.approx(np.cos(t).min())
     assert max(x.high) == pytest.approx(1.0)
+
+
+def test_a_heated_block(tmp_path: Path):
+    """The last of the temperatures answers; one that a name calls ambient stays context."""
+    t = np.arange(300.0)
+    found = guess(table(tmp_path, "t_s,heater_W,block_degC,ambient_degC", t, np.sin(t), 30 + np.cos(t), 20 + 0.1 * t))
+    assert [c.role for c in found.columns] == ["time", "input", "output", "context"]
+    assert "outputs are 'block_degC'" in found.assumed
+
+
+def test_a_twin_that_units_alone_suggest_is_an_assumption(tmp_path: Path):
+    t = np.arange(300.0)
+    found = guess(table(tmp_path, "t_s,valve_V,stroke_mm", t, np.sin(t), np.cos(t)))
+    assert found.kind == "piezo_stack"
+    assert any("the twin is a piezo_stack, by its units alone" in text for text in found.assumed)
+
+
+@pytest.mark.parametrize("kind", ["ode", "state_space"])
+def test_the_file_of_an_open_twin_has_its_tables(tmp_path: Path, kind: str):
+    """With the examples of the file made valid, the recording loads."""
+    t = np.arange(300) / 100.0
+    data = table(tmp_path, "t_s,current_A,speed_rad_s", t, np.sin(t), np.cos(3 * t))
+    made = new_recording(data, kind=kind)
+    text = made.path.read_text()
+    assert made.guess.unknown
+    if kind == "ode":
+        assert "in [twin.parameters]" in made.guess.unknown[0]
+        text = text.replace("# speed =", "speed =").replace("# fixed =", "gain = 2.0\ntime_constant = 0.3\n# fixed =")
+        made.path.write_text(text)
+        assert load(made.path).unit == {"current": "A", "speed": "rad/s"}
+    else:
+        assert "# A = # needed" in text
 
 
 def test_npz_and_names_without_units(tmp_path: Path):

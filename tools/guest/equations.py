@@ -215,10 +215,21 @@ def trace(builder: Builder, function: Callable[..., object], groups: Mapping[str
         found = function(Traced(builder, at["t"]), *parts)
     except EquationError:
         raise
+    except KeyError as error:
+        known = "; ".join(f"{g}: {', '.join(groups[g]) or 'none'}" for g in ("states", "inputs", "parameters"))
+        raise EquationError(f"derivatives asks for {error}; each value has a name, and there are {known}") from error
     except Exception as error:
-        raise EquationError(f"derivatives cannot be written as equations ({error!r})") from error
+        if Traced.__name__ in str(error):  # math.sin, scipy, float(...): they need the number itself
+            raise EquationError(
+                f"derivatives cannot be written as equations ({error}); in place of math and scipy use numpy's"
+                f" {', '.join(FUNCTIONS)}"
+            ) from error
+        raise EquationError(
+            f"derivatives(t, states, inputs, parameters) cannot be written as equations ({error!r})"
+        ) from error
     if not isinstance(found, Mapping):
-        raise EquationError(f"derivatives must return a derivative for each state by name, got {type(found).__name__}")
+        example = ", ".join(f"'{s}': ..." for s in groups["states"])
+        raise EquationError(f"derivatives must return {{{example}}}, got {type(found).__name__}")
     return {str(k): register_of(builder, v) for k, v in found.items()}
 
 

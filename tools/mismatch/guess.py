@@ -21,7 +21,7 @@ import numpy as np
 
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
-from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit
+from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit, word
 from tools.mismatch.recording_columns import Array, column_names, column_units, first_line, read_blocks, read_scalars
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
@@ -144,6 +144,8 @@ def guess(path: Path, kind: str = "") -> Guess:
     notes += found.notes
     assumed += found.assumed
     unknown = [] if kind else [_no_kind(kinds, left, parts, found)]
+    if kind and not given and not any(word(parts[k][0]) == found.signals.get(k) for k in left):
+        assumed.append(f"the twin is a {kind}, by its units alone; for another repeat with --twin KIND")
     bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
     if bare:
         assumed.append("units: " + ", ".join(f"'{k}' in {_assumed_unit(kind, found, k) or '1'}" for k in bare))

@@ -17,8 +17,10 @@ Fits = Callable[[str, str, str, tuple[str, ...]], bool]
 _SUFFIX = re.compile(
     r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
 )
-_ORDINARY_WORDS = ("in", "min", "h")
-"""Units that are also words (``x_in``, ``x_min``). They count as units in brackets only."""
+_QUOTIENT = re.compile(r"^(?P<name>.+?)_(?P<over>[^\W\d_]+)_(?P<under>s2?|m2)$")
+"""A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``."""
+_ORDINARY_WORDS = ("in", "ft", "min", "h", "l", "L", "F", "H")
+"""Units that are also words or letters (``x_in``, ``x_min``, ``wheel_l``). They count as units in brackets only."""
 _WORDS: tuple[tuple[GuessedRole, str], ...] = (
     ("context", r"temp|supply|ambient|humid|status|flag|state"),
     ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
@@ -48,6 +50,13 @@ class Assignment:
 
 def split_unit(name: str) -> tuple[str, str]:
     """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
+    quotient = _QUOTIENT.match(name.strip())
+    if quotient is not None and quotient["over"] != "in":
+        try:
+            units.parse(quotient["over"])
+            return quotient["name"], f"{quotient['over']}/{quotient['under']}"
+        except units.UnitError:
+            pass
     found = _SUFFIX.match(name.strip())
     if found is None:
         return name.strip(), ""
@@ -221,6 +230,10 @@ def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
     """Assign roles for a twin that takes any signal: by name, else the first column drives and the others answer."""
     roles: dict[str, GuessedRole] = {name: guess_role(*parts[name]) for name in names}
     used = [name for name in names if roles[name] != "context"]
+    if len(used) < 2:  # a heater: the last temperatures are no context, unless a name says so
+        by_unit = [name for name in names if roles[name] == "context" and not role_of_name(parts[name][0])]
+        roles |= dict.fromkeys(by_unit[len(used) - 2 :], "")
+        used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
     named_roles = dict(roles)

@@ -65,6 +65,7 @@ HOLD = Key(
     "between samples the input runs straight, is held, or has nothing above half the rate",
     "inferred, else linear",
 )
+HOLD_OR_STRAIGHT = Key("hold", "linear, zero", "between samples the input runs straight or is held", HOLD.default)
 _PER_OUTPUT = "number, list or table by output"
 _AXES = "number, list or table by output (x, y, z)"
 
@@ -73,17 +74,17 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
         "piezo_stack": (
             Key("gain_um_per_V", _PER_OUTPUT, "displacement per volt", "least squares"),
             Key("offset_um", _PER_OUTPUT, "displacement at 0 V", "least squares"),
-            HOLD,
+            HOLD_OR_STRAIGHT,
         ),
         "accelerometer": (
             Key("bias_V", _AXES, "output at 0 g", "least squares"),
             Key("scale_V_per_g", _AXES, "volts per g", "least squares"),
-            HOLD,
+            HOLD_OR_STRAIGHT,
         ),
         "magnetometer": (
             Key("bias_V", _AXES, "output in no field", "least squares"),
             Key("scale_V_per_uT", _AXES, "volts per microtesla", "least squares"),
-            HOLD,
+            HOLD_OR_STRAIGHT,
         ),
         "accelerometer_cluster": (
             Key("positions_m", 'table { "1" = [x, y, z] }', "place of each sensor from the body origin", "the origin"),
@@ -119,20 +120,29 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("start_s", "0 to 3600", "how long that world had run at the first sample", "0"),
         ),
         "ode": (
-            Key("states", "table by state", "unit, start and limits of each state"),
+            Key(
+                "states",
+                "table by state",
+                "unit (an output of that name is converted to it), start and limits of each state",
+            ),
             Key(
                 "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
             ),
             Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
             Key("function", "file.py:name", "derivatives(t, states, inputs, parameters) in place of equations", "none"),
-            Key("units", "table by parameter", "unit of each parameter", "none"),
+            Key(
+                "units",
+                "table by name",
+                "of each parameter; of an input or output that the equations want in another unit than its column's",
+                "none",
+            ),
             Key("fixed", "list of names", "parameters that are not re-fitted", "none"),
-            HOLD,
+            HOLD_OR_STRAIGHT,
             Key("any other name", "number", "a parameter of the equations; may be re-fitted"),
         ),
         "fmu": (
             Key("path", "file name", "the FMU beside the recording: co-simulation (FMI 2, 3), model exchange (2)"),
-            Key("hold", "zero or linear", "inputs between samples", "inferred"),
+            HOLD_OR_STRAIGHT,
             Key("any parameter of the FMU", "number", "your value; may be re-fitted", "the FMU's"),
         ),
     }

@@ -130,6 +130,8 @@ def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:
 def _needed(kind: str) -> list[str]:
     """Return a message on the parameters that a kind of twin requires; empty if it requires none."""
     keys = [k.name for k in of_kind(kind) if not k.default and k.name.isidentifier()] if kind in KINDS else []
+    if kind == "ode":
+        return ["the twin's equations: write [twin.states], [twin.equations] and the numbers in [twin.parameters]"]
     return [f"the twin's {', '.join(keys)}: a {kind} needs them in [twin.parameters]"] if keys else []
 
 

@@ -35,9 +35,12 @@ def _lines(found: Guess, source: str, data: str, stretch: Stretch | None) -> Ite
     yield ""
     yield "[twin]"
     yield f"kind = {json.dumps(found.kind)}" if found.kind else f'# kind = "" # unknown; one of {", ".join(KINDS)}'
+    tables = () if found.kind != "ode" else ("states", "equations", "outputs", "function", "units")
+    if tables:
+        yield from _equations(found)
     yield "[twin.parameters] # what you believe today"
     for key in of_kind(found.kind) if found.kind else ():
-        if key.name.isidentifier():
+        if key.name.isidentifier() and key.name not in tables:
             yield _parameter(key)
     for column in found.columns:
         if column.role in ("input", "output", "context"):
@@ -55,6 +58,18 @@ def _clock(found: Guess, stretch: Stretch | None) -> Iterator[str]:
         yield f"rate_hz = {found.rate_hz!r}"
     else:
         yield "# rate_hz = # unknown: samples per second"
+
+
+def _equations(found: Guess) -> Iterator[str]:
+    """Yield the tables of differential equations, with an example in the names of the columns."""
+    drive, answer = (next(c for c in found.columns if c.role == role) for role in ("input", "output"))
+    yield '# function = "FILE.py:NAME" # derivatives(t, states, inputs, parameters), in place of [twin.equations]'
+    yield "[twin.states] # each state with its unit, or with a table of unit, start, min and max"
+    yield f"# {answer.signal} = {json.dumps(answer.unit, ensure_ascii=False)}"
+    yield "[twin.equations] # the derivative of each state"
+    yield f'# {answer.signal} = "(gain * {drive.signal} - {answer.signal}) / time_constant" # an example'
+    yield "[twin.outputs] # outputs that are no state"
+    yield "[twin.units] # units of parameters; of an input or output where the equations want another than the column's"
 
 
 def _parameter(key: Key) -> str:

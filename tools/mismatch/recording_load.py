@@ -163,7 +163,7 @@ def from_table(
         input_noise=input_noise,
         conditions=_conditions(where, text.get("conditions")),
     )
-    if twin.kind == "state_space":
+    if twin.kind in ("state_space", "ode"):
         from tools.mismatch.recording_units import in_twin_units
 
         return in_twin_units(recording)

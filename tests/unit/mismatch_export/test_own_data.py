@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.unit.mismatch_model.made import recording
 from tools.cli.main import app
+from tools.errors import RecordingError
 from tools.mismatch import key_tables as keys
 from tools.mismatch.export.write import FORMATS
 from tools.mismatch.keys import Key
 from tools.mismatch.recording_load import load
+from tools.mismatch.twins.make import make
 from tools.mismatch.twins.vocabulary import KINDS
 from tools.research.reports.own_data_page import page
 
@@ -51,7 +54,7 @@ def test_a_stranger_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.Monke
     module elsewhere."""
     monkeypatch.chdir(tmp_path)
     make, again, elsewhere = blocks("python")
-    toml, believed = blocks("toml")
+    toml, believed, _ = blocks("toml")
     (commands,) = blocks("bash")
     five = commands.strip().splitlines()
     assert len(five) == 5
@@ -102,6 +105,38 @@ def test_only_the_keys_of_the_tables_are_known(tmp_path: Path) -> None:
     notes = load(tmp_path).warnings
     assert "key 'place' is unknown and not used" in notes
     assert "[[channels]] 2: key 'colour' is unknown and not used" in notes
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero", "smooth"])
+@pytest.mark.parametrize("kind", ["piezo_stack", "mechanical_axis", "state_space", "ode"])
+def test_a_hold_is_taken_if_and_only_if_the_page_lists_it(kind: str, hold: str) -> None:
+    listed = next(k for k in keys.of_kind(kind) if k.name == "hold").value.split(", ")
+    matrices = {"A": [[-2.0]], "B": [[1.0]], "C": [[1.0]]}
+    ode = {"states": {"position": "m"}, "equations": {"position": "force - position"}}
+    given = {"state_space": matrices, "ode": ode, "mechanical_axis": {"mass": 1.0, "damping": 2.0}}.get(kind, {})
+    u, y = ("command", "displacement") if kind == "piezo_stack" else ("force", "position")
+    t = np.arange(200) * 0.01
+    made = recording(kind, 0.01, {u: np.sin(t)}, {y: np.cos(t)}, {}, {**given, "hold": hold})
+    if hold in listed:
+        make(made)
+    else:
+        with pytest.raises(RecordingError, match="hold must be"):
+            make(made)
+
+
+def test_the_equations_of_the_page_are_a_twin(tmp_path: Path) -> None:
+    """The page's example of equations loads and builds."""
+    shown = next(t for t in re.findall(r"^``` \{ \.toml[^\n]*\n(.*?)^```", page(), re.S | re.M) if '"ode"' in t)
+    t = np.arange(300) * 0.01
+    np.savez(tmp_path / "data.npz", i=np.sin(t), w=60 * np.cos(t))
+    (tmp_path / "recording.toml").write_text(
+        f'format = 1\ndata = "data.npz"\nrate_hz = 100.0\n{shown}'
+        '[[channels]]\ncolumn = "i"\nrole = "input"\nsignal = "current"\nunit = "A"\n'
+        '[[channels]]\ncolumn = "w"\nrole = "output"\nsignal = "speed"\nunit = "rpm"\n'
+    )
+    found = load(tmp_path)
+    assert found.unit["speed"] == "rad/s"
+    assert [p.name for p in make(found).parameters] == ["torque_per_A", "bearing"]
 
 
 def test_a_key_that_nobody_described_is_listed() -> None:

@@ -142,6 +142,26 @@ def test_a_function_that_branches_on_a_state_says_how_to_write_it() -> None:
         trace(Builder(("t", "x")), derivatives, groups)
 
 
+@pytest.mark.parametrize(
+    ("derivatives", "message"),
+    [
+        (lambda t, s, u, p: {"x": s["y"]}, r"asks for 'y'.*states: x; inputs: none; parameters: none"),
+        (lambda t, s, u, p: {"x": s[0]}, r"asks for 0.*states: x"),
+        (lambda t, s, u, p: {"x": math.tanh(s["x"])}, r"in place of math and scipy use numpy's"),
+        (lambda t, s: {"x": s["x"]}, r"derivatives\(t, states, inputs, parameters\)"),
+        (lambda t, s, u, p: [s["x"]], r"must return \{'x': \.\.\.\}, got list"),
+    ],
+)
+def test_a_function_that_cannot_be_traced_says_what_to_write(derivatives, message: str) -> None:
+    with pytest.raises(EquationError, match=message):
+        trace(Builder(("t", "x")), derivatives, {"states": ("x",), "inputs": (), "parameters": ()})
+
+
+def test_a_caret_is_no_power() -> None:
+    with pytest.raises(EquationError, match=r"write a power as \*\*"):
+        value_of("a^2", a=1.0)
+
+
 def test_a_free_run_is_the_solution(tmp_path: Path) -> None:
     """A pendulum with drag, against an adaptive solver of high order."""
     twin = """

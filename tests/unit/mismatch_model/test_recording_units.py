@@ -1,4 +1,4 @@
-"""In which units a state-space twin speaks: whatever makes the twin as given move as much as the recording."""
+"""In which units a twin of matrices or equations speaks: what it states, else what makes it move as the recording."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.recording_units import si_unit
 
@@ -80,3 +81,65 @@ def test_si_of_a_dimension() -> None:
     assert [si_unit(u) for u in ("mV", "um", "deg/s", "G", "V", "degC", "%", "count")] == [
         "V", "m", "rad/s", "T", "V", "degC", "%", "count",
     ]  # fmt: skip
+
+
+def equations(folder: Path, state: str, more: str = "", unit: str = "mm", scale: float = 1e3) -> Path:
+    """A body on a spring, its equations in N, kg and m; the channels are in mN and ``unit``."""
+    t = np.arange(N) * DT
+    u = np.sin(2 * np.pi * t)
+    np.savez(folder / "data.npz", u=1e3 * u, y=scale * u / 50.0)
+    (folder / "recording.toml").write_text(
+        f"""format = 1
+data = "data.npz"
+rate_hz = {1 / DT}
+[twin]
+kind = "ode"
+[twin.states]
+x = "{state}"
+v = ""
+[twin.equations]
+x = "v"
+v = "(drive - 50 * x - 20 * v) / mass"
+[twin.parameters]
+mass = 0.01
+{more}
+[[channels]]
+column = "u"
+role = "input"
+signal = "drive"
+unit = "mN"
+[[channels]]
+column = "y"
+role = "output"
+signal = "x"
+unit = "{unit}"
+"""
+    )
+    return folder
+
+
+def test_a_channel_is_converted_to_the_unit_of_its_state(tmp_path: Path) -> None:
+    """The equations state metres; that the force is in newtons shows in how far they then move."""
+    found = load(equations(tmp_path, "m"))
+    assert (found.unit["drive"], found.unit["x"]) == ("N", "m")
+    assert np.ptp(found.outputs["x"]) == pytest.approx(2.0 / 50.0, rel=1e-3)
+    assert any("fit drive in N: converted" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(("read", "wanted"), [("N", "N"), ("mN", "mN")])
+def test_units_may_state_that_of_an_input(tmp_path: Path, read: str, wanted: str) -> None:
+    found = load(equations(tmp_path, "m", f'[twin.units]\ndrive = "{read}"'))
+    assert found.unit["drive"] == wanted
+    assert not any("converted" in w for w in found.warnings)
+
+
+def test_equations_in_the_units_of_the_columns_stay_as_they_are(tmp_path: Path) -> None:
+    """50 mN/mm is 50 N/m: nothing tells millinewtons and millimetres from newtons and metres, so nothing is changed."""
+    found = load(equations(tmp_path, "mm"))
+    assert (found.unit["drive"], found.unit["x"]) == ("mN", "mm")
+    assert found.warnings == ()
+
+
+def test_a_channel_of_another_dimension_than_its_state_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"'x' is recorded in rad, and \[twin.states\] states m"):
+        load(equations(tmp_path, "m", unit="rad"))

@@ -145,6 +145,8 @@ def parse(builder: Builder, texts: Mapping[str, str], wanted: Sequence[str]) -> 
                 return builder.operation(code, b, a) if turned else builder.operation(code, a, b)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 return called(builder, name, [value(a, where) for a in args], where)
+            case ast.BinOp(op=ast.BitXor()):
+                raise EquationError(f"equation of '{where}': '{ast.unparse(node)}': write a power as **, not ^")
             case _:
                 raise EquationError(
                     f"equation of '{where}': '{ast.unparse(node)}' is not allowed; use numbers, names, + - * / ** < >,"

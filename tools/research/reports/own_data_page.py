@@ -86,6 +86,27 @@ noise_rms = 0.02
 `hold = "zero"` says that a computer held the force over each sample. Without it the report names friction here, and the
 verdict is `unexplained`. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
 
+Your own equations are text, or a Python function that is traced once ([a twin of your own](adding/twin.md)). An output
+with the name of a state is converted to its unit, and forces are tried at every state:
+
+``` { .toml title="a fan, in place of the [twin] above" }
+[twin]
+kind = "ode"
+
+[twin.states]
+speed = "rad/s"          # or { unit = "rad/s", start = 0.0 }
+
+[twin.equations]         # the derivative of each state
+speed = "(torque_per_A * current - bearing * speed) / inertia"
+
+[twin.parameters]        # re-fitted, but for those in fixed
+torque_per_A = 0.045
+bearing = 8e-4
+inertia = 1.8e-3
+fixed = ["inertia"]      # it scales the others: only ratios show in the data
+hold = "zero"
+```
+
 Name the commanded value as input where there is one. An input that was measured has noise, and an effect that smooths
 it (a lag, a resonance) then predicts better although the machine has none: state its `noise_rms`, too. The tool then
 uses what is expected of the input given its whole course, and counts what is left of its noise as noise of the output.
