@@ -89,6 +89,8 @@ def test_columns_name_what_is_behind_the_motor_and_advise_for_the_rest(recording
     else:
         # a delay could be a time constant of the simulation that is off, which columns do not let be re-fitted
         assert report.verdict == "unexplained"
+    if variant == "delay":
+        assert "wrong parameter of the simulation" in report.summary
 
 
 @pytest.mark.slow

@@ -316,6 +316,13 @@ def summary(
         if times > MUCH_LEFT and b[o] > problem.recording.tolerance.get(o, 0.0):
             text += f" That is still {number(times)} times the noise: it is not the whole account."
         return text
+    if decision.meaning == "place_not_reachable" and physics and all(imitable(physics, problem.twin)):
+        names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
+        least = all(b[o] <= MUCH_LEFT * decision.floors[o][1] for o in guilty)
+        return (
+            f"What {names} explains of {outputs}{', down to the noise,' if least else ''} may also be a wrong parameter of"
+            " the simulation that made the columns."
+        )
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
     if decision.meaning == "floor_doubtful":
         return f"Something may be left in {outputs}{what}; whether it is noise this recording does not say."
