@@ -212,6 +212,11 @@ class Model:
         flow = self._flow(view_run(self.twin, view), Pass(theta, True), only=only)
         return {o: view.take(s.value) for o, s in flow.items()}
 
+    def in_front(self, view: View, theta: Array) -> dict[str, Array]:
+        """Return the outputs (n,) of a free run in front of the effects at outputs."""
+        outputs = self._courses(view_run(self.twin, view), Pass(theta, True))[1]
+        return {o: view.take(s.value) for o, s in outputs.items()}
+
     def whole(self, view: View, theta: Array) -> dict[str, Array]:
         """Return the outputs over the whole recording (n,) from the start states that the view allows; cached."""
         key = ("whole", self.key, theta.tobytes())
@@ -312,6 +317,17 @@ class Model:
         beside: Sequence[Force] = (),
         only: Collection[str] | None = None,
     ) -> dict[str, Signal]:
+        return self._courses(run, how, given, beside, only)[0]
+
+    def _courses(
+        self,
+        run: Run,
+        how: Pass,
+        given: Mapping[str, Signal] | None = None,
+        beside: Sequence[Force] = (),
+        only: Collection[str] | None = None,
+    ) -> tuple[dict[str, Signal], dict[str, Signal]]:
+        """Return the outputs behind their effects, and in front of them."""
         how = replace(how, theta=np.asarray(how.theta, np.float64))
         theta, folded = how.theta, how.folded
         inputs, forces = self._driven(run, how, given)
@@ -330,8 +346,9 @@ class Model:
         for _ in range(START_PASSES if run.window and behind else 0):
             run = before_effects(recorded, behind)
             outputs = self.twin.respond(run, inputs, theta, every, how.join)
-            found, behind = self._behind(run, inputs, {o: outputs[o] for o in found}, how)
-        return found
+            outputs = {o: outputs[o] for o in found}
+            found, behind = self._behind(run, inputs, outputs, how)
+        return found, outputs
 
     def _behind(
         self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], how: Pass

@@ -84,7 +84,7 @@ def module_of(twin: Corrected, report: Mapping[str, Any]) -> str:
     # effects behind the states do not set them, and forces are small over a few samples
     free = [part_of(twin, [pl for pl in twin.model.placed if pl.site in sites]) for sites in (FORCED, ("input",))]
     run, linear = (runnable(text(part, np.zeros(order))) for part in free)
-    return text(twin, start_state(run, linear, free[0], order))
+    return text(twin, start_state(run, linear, twin, order))
 
 
 FORCED = ("input", "feedback")
@@ -115,12 +115,12 @@ def order_of(twin: Corrected) -> int:
 
 
 def start_state(run: Any, linear: Any, twin: Corrected, order: int) -> Array:
-    """Fit the state (order,) from which ``run`` reproduces the engine's own free run of the recording.
+    """Fit the state (order,) from which ``run`` reproduces the engine's own free run in front of effects at outputs.
 
     ``linear`` is the run without forces, whose response to a change of the state is known.
     """
     rec = twin.recording
-    wanted = whole_run(rec, twin.model, twin.theta)
+    wanted = twin.model.in_front(whole_view(rec, twin.model), twin.theta)
     scale = {o: float(np.std(y)) or 1.0 for o, y in wanted.items()}
     signals = in_file_units(rec)
 
