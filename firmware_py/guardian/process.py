@@ -182,9 +182,11 @@ def main(arguments: list[str]) -> int:
         retry_s=order["retry_s"],
         end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
     )  # fmt: skip
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
     with realtime(RealtimeConfig(priority=PRIORITY)):
+        # not before: from its word on a guardian that is silent for 100 ms counts as lost, and the settings may take so
+        # long on a busy machine
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
         serve(guardian, order["pipe"], heart.mark)
     report = guardian.report()
     partial = Path(order["report"] + ".partial")
