@@ -40,7 +40,6 @@ END_POLL_S = 0.002
 REPORT = "guardian.json"
 STARTED = "guardian.started"
 """There is a guardian; the file holds the seconds for which it may try to reach neutral."""
-_ROOT = Path(__file__).resolve().parents[2]
 
 
 class GuardianProcess:

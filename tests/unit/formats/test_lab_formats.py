@@ -270,3 +270,23 @@ def test_parquet_times_are_seconds_and_empty_cells_nan(tmp_path: Path):
     assert np.array_equal(found["x"], [1.0, np.nan, 3.0], equal_nan=True)
     with pytest.raises(RecordingError, match="column 'who' is object"):
         read_columns(path, ["who"])
+
+
+def test_a_recording_of_ours_is_a_data_file_like_any_other(run: Recording) -> None:
+    assert column_names(run.path) == list(run.names)
+    assert column_units(run.path) == dict(COLUMNS)
+    read = read_columns(run.path, [run.names[2], run.names[0]])
+    assert list(read) == [run.names[2], run.names[0]]
+    for name, values in read.items():
+        assert np.array_equal(values, run.column(name), equal_nan=True)
+    with pytest.raises(RecordingError, match="no column 'absent'"):
+        read_columns(run.path, ["absent"])
+
+
+def test_an_array_of_two_dimensions_in_an_npz_is_numbered_columns(tmp_path: Path) -> None:
+    values = np.arange(12.0).reshape(4, 3)
+    np.savez(tmp_path / "d.npz", a=values, t=np.arange(4), wide=np.zeros((4, 17)), one=np.float64(3.0))
+    assert column_names(tmp_path / "d.npz") == ["a_0", "a_1", "a_2", "t"]
+    assert read_columns(tmp_path / "d.npz", ["a_2"])["a_2"] == pytest.approx(values[:, 2])
+    with pytest.raises(RecordingError, match=r"'wide' is float64 of shape \(4, 17\)"):
+        read_columns(tmp_path / "d.npz", ["wide"])
