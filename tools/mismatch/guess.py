@@ -155,21 +155,11 @@ def guess(path: Path, kind: str = "") -> Guess:
         if found.roles[k] and seen[k].missing
     ]
     clock_unit = parts[clock][1] or "s" if clock else "s"
-    time_column, rate_hz = clock, None
     if stamps is not None:
-        rate_hz = stamps.rate_hz
-        if units.parse(clock_unit).factor != 1.0:
-            time_column = ""
-        usable = stamps.is_usable if time_column else stamps.is_even
-        if not usable:
-            broken.append(_broken_clock(clock, stamps))
-        elif not time_column:
-            notes.append(f"column '{clock}' is the time in {clock_unit}: its even steps are written as rate_hz")
-        elif stamps.faults:
-            notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
+        time_column, rate_hz = _time_of(clock, clock_unit, stamps, broken, notes)
     else:
         constants = {k: c.smallest for k, c in seen.items() if c.smallest == c.largest}
-        rate_hz = _rate_beside({**constants, **read_scalars(path)}, notes)
+        time_column, rate_hz = clock, _rate_beside({**constants, **read_scalars(path)}, notes)
         if rate_hz is None:
             unknown.append("the rate: no column is a time that runs forwards; set rate_hz, or repeat with --rate HZ")
     columns = [
@@ -185,6 +175,19 @@ def guess(path: Path, kind: str = "") -> Guess:
         for k in names
     ]
     return Guess(n, time_column, rate_hz, kind, columns, unknown, broken, assumed, notes, clock, clock_unit, row)
+
+
+def _time_of(clock: str, unit: str, stamps: Stamps, broken: list[str], notes: list[str]) -> tuple[str, float | None]:
+    """Return the time column, empty where even steps in another unit than s become a rate, and the rate in Hz."""
+    time_column = clock if units.parse(unit).factor == 1.0 else ""
+    usable = stamps.is_usable if time_column else stamps.is_even
+    if not usable:
+        broken.append(_broken_clock(clock, stamps))
+    elif not time_column:
+        notes.append(f"column '{clock}' is the time in {unit}: its even steps are written as rate_hz")
+    elif stamps.faults:
+        notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
+    return time_column, stamps.rate_hz
 
 
 def place(sample: int, row_of_first: int) -> str:
