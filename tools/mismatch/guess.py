@@ -22,7 +22,15 @@ import numpy as np
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
 from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit, word
-from tools.mismatch.recording_columns import Array, column_names, column_units, first_line, read_blocks, read_scalars
+from tools.mismatch.recording_columns import (
+    Array,
+    column_names,
+    column_units,
+    first_line,
+    own_recording,
+    read_blocks,
+    read_scalars,
+)
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.stamps import StampReader, Stamps
@@ -111,6 +119,10 @@ def guess(path: Path, kind: str = "") -> Guess:
 
     Raises RecordingError.
     """
+    if own_recording(path) is not None:
+        raise RecordingError(
+            f"{path}: a recording of micron run; 'micron export {path} FOLDER' writes it with its twin and bench"
+        )
     names = column_names(path)
     if not names:
         raise RecordingError(
@@ -119,9 +131,11 @@ def guess(path: Path, kind: str = "") -> Guess:
     if len(names) > MOST_COLUMNS:
         raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
     file_units = column_units(path)
-    parts = {k: (k, file_units[k]) if file_units.get(k) else split_unit(k) for k in names}
+    parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else split_unit(k) for k in names}
     words = words_in(path)
     notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
+    unknown_units = {k: u for k, u in file_units.items() if u and not units.is_unit(u)}
+    notes += [f"column '{k}': its unit '{u}' in the file is not known" for k, u in unknown_units.items()]
     row = first_line(path)
     seen, stamps, clock, n, assumed = _scan(path, names, parts, row)
     if n < 2:

@@ -20,6 +20,7 @@ from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.formats.export import export
 from tools.formats.netcdf import dataset
+from tools.mismatch.guess import guess
 from tools.mismatch.recording_columns import column_names, column_units, read_columns
 from tools.mismatch.recording_load import load
 
@@ -290,3 +291,20 @@ def test_an_array_of_two_dimensions_in_an_npz_is_numbered_columns(tmp_path: Path
     assert read_columns(tmp_path / "d.npz", ["a_2"])["a_2"] == pytest.approx(values[:, 2])
     with pytest.raises(RecordingError, match=r"'wide' is float64 of shape \(4, 17\)"):
         read_columns(tmp_path / "d.npz", ["wide"])
+
+
+def test_a_recording_of_ours_is_not_guessed_because_export_knows_it(run: Recording) -> None:
+    with pytest.raises(RecordingError, match="a recording of micron run"):
+        guess(run.path)
+
+
+def test_a_unit_that_nobody_knows_is_said_and_left_out(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray", reason="extra: pip install 'micron-bench[lab]'")
+    t = np.arange(3000) * 1e-3
+    drive = np.sin(9.0 * t) * 40.0 + 50.0
+    columns = {"t": (t, "s"), "drive": (drive, "V"), "move": (0.1 * drive**1.01, "um"), "flags": (np.floor(t), "bits")}
+    data = xarray.Dataset({name: ("row", values, {"units": unit}) for name, (values, unit) in columns.items()})
+    data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
+    found = guess(tmp_path / "d.nc")
+    assert "column 'flags': its unit 'bits' in the file is not known" in found.notes
+    assert {c.name: c.unit for c in found.columns}["flags"] == ""
