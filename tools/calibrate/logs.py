@@ -93,7 +93,7 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
 
 
 def _find(path: Path) -> tuple[Path, Path | None]:
-    """Return the data file and its descriptor."""
+    """Return the data file and its descriptor: a ``recording.toml`` that names it, or the ``meta.toml`` of a set."""
     if path.is_dir():
         for name in ("recording.toml", "meta.toml"):
             if (path / name).is_file():
@@ -101,8 +101,10 @@ def _find(path: Path) -> tuple[Path, Path | None]:
         return path / "data.npz", None
     if path.suffix.lower() == ".toml":
         return _data(path), path
-    beside = next((p for p in (path.parent / n for n in ("recording.toml", "meta.toml")) if p.is_file()), None)
-    return path, beside
+    descriptor, about_all = path.parent / "recording.toml", path.parent / "meta.toml"
+    if descriptor.is_file() and _data(descriptor) == path:
+        return path, descriptor
+    return path, about_all if about_all.is_file() else None
 
 
 def _data(descriptor: Path) -> Path:

@@ -308,3 +308,12 @@ def test_a_unit_that_nobody_knows_is_said_and_left_out(tmp_path: Path) -> None:
     found = guess(tmp_path / "d.nc")
     assert "column 'flags': its unit 'bits' in the file is not known" in found.notes
     assert {c.name: c.unit for c in found.columns}["flags"] == ""
+
+
+def test_the_descriptor_of_another_file_beside_it_says_nothing_of_a_log(run: Recording) -> None:
+    other = 'data = "other.csv"\ntime_column = "time_s"\nrate_hz = 5.0\n'
+    (run.path.parent / "recording.toml").write_text(other)
+    assert load_log(run.path).time_column == "t"
+    (run.path.parent / "recording.toml").write_text(other.replace("other.csv", run.path.name))
+    with pytest.raises(InputError, match="time_column 'time_s' is no column"):
+        load_log(run.path)
