@@ -52,18 +52,21 @@ SCANS, LATE, SENT, DT_NS, EVERY, DAQ_FD, OUTPUT_FD = range(7)
 
 class Bare(NamedTuple):
     """Holds the times of a bare loop from scan to command, us, the share of scans that had no command of their own
-    because they came with a newer one, %, the time in ms that the host took from the machine, and the time in ms for
-    which the kernel kept the loop waiting."""
+    because they came with a newer one, %, the time in ms that the host took from the machine, the time in ms for
+    which the kernel kept the loop waiting, and the number of the world's pauses and the longest one in ms."""
 
     late_us: list[float]
     without_command: float
     stolen_ms: float
     kept_waiting_ms: float
+    pauses: int
+    longest_pause_ms: float
 
     @property
     def host(self) -> str:
         """Say what host and kernel did meanwhile."""
-        return f"host took {self.stolen_ms:g} ms, kernel {self.kept_waiting_ms:.1f} ms"
+        world = f"{self.pauses} pauses of the world (longest {self.longest_pause_ms:.1f} ms)"
+        return f"host took {self.stolen_ms:g} ms, kernel {self.kept_waiting_ms:.1f} ms, {world}"
 
 
 @thread_kernel
@@ -166,11 +169,13 @@ def measure(file: Path, seconds: float, tick_hz: int, *, polls: bool = False) ->
             else:
                 is_whole, before_ms, before_ns = False, 0.0, 0
             taken_ms, waited_ms = stolen_ms() - before_ms, (kept_waiting_ns() - before_ns) * 1e-6
+            pauses, longest_ms = opened.world.stalls() if opened.world is not None else (0, 0.0)
         if not is_whole:
             raise RuntimeError("the scans ended before the bare loop did")
         daq.stop()
         output.close()
-    return Bare((late_ns * 1e-3).tolist(), 100.0 * words[LATE] / words[SCANS], taken_ms, waited_ms)
+    late = 100.0 * words[LATE] / words[SCANS]
+    return Bare((late_ns * 1e-3).tolist(), late, taken_ms, waited_ms, pauses, longest_ms)
 
 
 if __name__ == "__main__":

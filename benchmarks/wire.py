@@ -80,8 +80,9 @@ class Run(NamedTuple):
     @property
     def without_command(self) -> float:
         """Share of scans, in %, that did not get a tick of their own: skipped, or caught up with in a later tick.
-        Nothing can be commanded before the outputs are armed: of a compiled run the scans since its thread was entered
-        first count, of a run in Python all but the ones that came while the outputs were being armed."""
+        Of a compiled run the scans since its thread was entered first count that came while the outputs could move: in
+        a hold nothing is commanded, and the bare loop has none. Of a run in Python all scans count but the ones that
+        came while the outputs were being armed."""
         ticks, loop = self.outcome["ticks"], self.outcome.get("loop", {})
         if "passed_over" in loop:
             return 100.0 * loop["passed_over"] / max(loop["ticks"] + loop["passed_over"], 1)
@@ -95,7 +96,12 @@ class Run(NamedTuple):
         held, safe = len(self.outcome["holds"]), self.outcome["safe_state"]
         ended = "" if safe["normal"] else f"; ended early: {safe['reason']}"
         sent = self.outcome["commands"]["sent"]
-        return f"{sent} commands, {compiled} of {ticks} ticks compiled, {held} holds, {self.host}{ended}"
+        loop = self.outcome.get("loop", {})
+        holds = f"{held} holds"
+        if "passed_over" in loop:
+            busy, idle = loop["passed_over_busy"], loop["passed_over_held"]
+            holds = f"{loop['passed_over']} scans passed over ({busy} at work), {holds} with {idle} more"
+        return f"{sent} commands, {compiled} of {ticks} ticks compiled, {holds}, {self.host}{ended}"
 
     @property
     def host(self) -> str:
@@ -190,6 +196,7 @@ def rows() -> Iterator[Row]:
         bare = Bare(
             before.late_us + after.late_us, (before.without_command + after.without_command) / 2,
             before.stolen_ms + after.stolen_ms, before.kept_waiting_ms + after.kept_waiting_ms,
+            before.pauses + after.pauses, max(before.longest_pause_ms, after.longest_pause_ms),
         )  # fmt: skip
         for kind, run in runs.items():
             if setup.tick_hz == 1000:

@@ -1,6 +1,6 @@
 """Describes the ADXL-203: two-axis accelerometer with analog outputs, read through a DAQ.
 
-The firmware calibrates it from volts (``firmware_py.sensing``); its facts are in ``drivers/sheets/adxl203.toml``.
+The firmware calibrates it from volts (``firmware_py.sensing``).
 """
 
 from __future__ import annotations

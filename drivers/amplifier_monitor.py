@@ -151,11 +151,13 @@ class AmplifierMonitor:
         shortest: list[tuple[float, float, float]] = []  # volts, least weight, further weight
         end_ns = window.latest_ns + window.longest_ns
         gone_late_ns = gone_early_ns = end_ns  # when the next command took over, at the latest and at the earliest
-        commands = self._guard.sent_commands
-        commanded_V = [command.volts[output] for command in commands]
+        commands = self._guard.sent_commands()  # most of them are older than the conversion, and are not looked at
         tick_V = self._guard.limits[output].slew_V_per_s * 1e-3
-        for k, command in reversed(list(enumerate(commands))):
-            ticks_worth = max(1.0, abs(commanded_V[k] - commanded_V[k - 1]) / tick_V) if k else 1.0  # after a gap
+        command = next(commands, None)
+        while command is not None:
+            before = next(commands, None)
+            value_V = command.volts[output]
+            ticks_worth = 1.0 if before is None else max(1.0, abs(value_V - before.volts[output]) / tick_V)  # a gap
             since_late_ns = command.sent_ns + round(self._settle_ns * ticks_worth)
             if command.offered_ns < end_ns:
                 least_ns = min(gone_early_ns, window.earliest_ns + window.shortest_ns) - max(
@@ -164,10 +166,11 @@ class AmplifierMonitor:
                 most_ns = min(gone_late_ns, end_ns) - max(command.offered_ns, window.earliest_ns)
                 least = max(0, least_ns) / window.longest_ns
                 most = min(1.0, max(0, most_ns) / window.shortest_ns)
-                shortest.append((command.volts[output], least, most - least))
+                shortest.append((value_V, least, most - least))
             if since_late_ns <= window.earliest_ns:  # all that came before had been replaced by this one
                 return _mean(sorted(shortest)), _mean(sorted(shortest, reverse=True))
             gone_late_ns, gone_early_ns = since_late_ns, command.offered_ns
+            command = before
         return None  # commands older than those that are kept
 
     def _judge(self, output: int, window: Window, measured_V: float) -> str:

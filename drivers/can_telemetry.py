@@ -73,7 +73,8 @@ class CanTelemetry:
                     "amplitude_y": _within(y, 6553.5),
                     "amplitude_z": _within(z, 6553.5),
                     "frequency": _within(frequency_Hz, 655.35),
-                }
+                },
+                strict=False,
             ),
         )
 
@@ -88,7 +89,8 @@ class CanTelemetry:
                     "lost_samples": min(lost_samples, 0xFFFF),
                     "skipped_ticks": min(skipped_ticks, 0xFFFF),
                     "worst_tick": round(_within(worst_tick_us, 65535.0)),
-                }
+                },
+                strict=False,
             ),
         )
 

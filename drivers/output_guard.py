@@ -34,7 +34,7 @@ from hal.types import OutputLimit
 __all__ = ["LISTED", "RAMP_STEPS", "OutputGuard", "SentCommand"]
 
 LISTED = KEPT - 1
-"""Number of commands in ``OutputGuard.sent_commands``."""
+"""Number of commands that ``OutputGuard.sent_commands`` yields at most."""
 
 
 class SentCommand(NamedTuple):
@@ -91,18 +91,17 @@ class OutputGuard:
     def clipped(self) -> int:
         return self.state.words[CLIPPED]
 
-    @property
-    def sent_commands(self) -> list[SentCommand]:
-        """Return the last ``LISTED`` commands, the newest last.
+    def sent_commands(self) -> Iterator[SentCommand]:
+        """Yield the last ``LISTED`` commands, the newest first.
 
         A compiled loop may send more in the meantime; what it could have overwritten is left out.
         """
         state, n = self.state, len(self.limits)
         newest = state.words[N_SENT]
         kept_ns, kept_V = state.kept_ns.tolist(), state.kept_V.tolist()
-        oldest = max(0, state.words[N_SENT] - LISTED)
-        places = (k % KEPT for k in range(oldest, newest))
-        return [SentCommand(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n])) for p in places]
+        for k in range(newest - 1, max(0, newest - LISTED) - 1, -1):
+            p = k % KEPT
+            yield SentCommand(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n]))
 
     def admit(self, values_V: Float64Array) -> int:
         """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.

@@ -202,9 +202,7 @@ STROKE = LAYOUT.start("stroke")
 COMMAND = LAYOUT.start("command")
 CLIP = LAYOUT.start("clip")
 STATUS = LAYOUT.start("status")
-SIZE = LAYOUT.size
 
-GAP = int(FrameStatus.GAP)
 STALE = int(FrameStatus.STALE)
 SATURATED = int(FrameStatus.SATURATED)
 INVALID = int(FrameStatus.INVALID)

@@ -83,8 +83,11 @@ class ActuationConfig(BaseModel):
 
     tick_hz: Positive = 1000.0
     gain: Annotated[float, Field(ge=0.0, le=2.0)] = 1.0
+    """Share of the predicted tremor that is cancelled; 1 cancels all of it."""
     ramp_s: Positive = 0.5
+    """Time in which the compensation of an axis fades in once its prediction is trusted, and out when it is not."""
     min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Confidence of the tremor stage (0 to 1) from which the prediction of an axis is trusted."""
 
     ball_circle_m: Positive = 0.005  # R = r, Ang 2004 (6.11)
     shaft_m: Positive = 0.040  # ball plane to tip
@@ -96,15 +99,15 @@ class ActuationConfig(BaseModel):
     """Time for which the peaks that make slow motion yield to tremor are remembered
     (firmware_py/actuation/yielding.py)."""
     yield_attack_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
-    """Time constant with which the scales follow a swing that grows; until then the strokes clip it. 0: at once, and
-    the rest by its position alone, whose corners shake the tip above the band."""
+    """Time constant with which the scales follow a swing that grows; until then the strokes clip it. With 0 they follow
+    at once, and slow motion yields by its position alone, whose corners shake the tip above the band."""
     overdrive: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
-    """Most that tremor beyond the stroke may swing along the shaft, in strokes: a clipped swing still cancels more than
-    one that just fits, and shakes the tip above the band with its corners. 0: every swing is clipped."""
+    """Largest swing along the shaft, in strokes, to which tremor beyond the stroke is scaled. A swing that is clipped
+    cancels more than one that just fits, and shakes the tip above the band with its corners. 0 clips every swing."""
     overdrive_tilts: bool = True
-    """False: only the swing along the shaft is limited so; a tilt beyond the stroke is clipped."""
+    """True if a tilt is scaled as well; False clips a tilt beyond the stroke."""
     overdrive_tilt: Annotated[float, Field(ge=0.0, le=100.0)] = 1.4
-    """The same of a tilt, which is beyond the stroke in short swings alone."""
+    """Largest tilt, in strokes. It may exceed ``overdrive``: a tilt is beyond the stroke in short swings only."""
     centring: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Share of the way from neutral to the middle of what the strokes reach; compensation works about that point.
     Stacks shrink less from neutral than they grow, so at 0 the shorter side is all that a swing may use."""

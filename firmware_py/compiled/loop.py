@@ -79,8 +79,10 @@ class CompiledMicron(Micron):
 
     Raises ``BenchError`` for others. ``spin_us``: the thread waits awake from so long before each scan is expected
     until so long after. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks that it
-    ran. In real time the report also has ``passed_over``, the scans without a tick of their own since the first entry,
-    and ``kept_waiting_ms``, see ``kept_waiting_ns``."""
+    ran. In real time the report also has ``passed_over``, the scans without a tick of their own since the first entry
+    while the outputs could move, ``passed_over_busy``, those of them that came while the thread was at work,
+    ``passed_over_held``, the others since then (holds, ramps and arming, in which nothing is commanded), and
+    ``kept_waiting_ms``, see ``kept_waiting_ns``."""
 
     def __init__(
         self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run, *, spin_us: float = 0.0
@@ -110,7 +112,8 @@ class CompiledMicron(Micron):
         self._words[at.SPIN_NS] = round(spin_us * 1e3)
         self._processors = os.sched_getaffinity(0)
         self._inside_ns = self._kept_waiting_ns = self._sync_due_ns = 0
-        self._passed_over_before = 0
+        self._passed_over = self._passed_over_held = self._passed_over_counted = 0
+        self._may_command = False
         self._counted = self._words.copy()
         self._tasks_counted = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
         self._memory: Memory | None = None
@@ -179,8 +182,13 @@ class CompiledMicron(Micron):
             spin = {"spin_us": int(self._words[at.SPIN_NS]) * 1e-3, "spin_share": share}
         real = {}
         if self.entries and not self._is_virtual:
-            passed_over = self.run.scheduler.passed_over - self._passed_over_before
-            real = {"passed_over": passed_over, "kept_waiting_ms": self._kept_waiting_ns * 1e-6}
+            self._count_passed_over(self._may_command)
+            real = {
+                "passed_over": self._passed_over,
+                "passed_over_busy": int(self._words[at.BUSY]),
+                "passed_over_held": self._passed_over_held,
+                "kept_waiting_ms": self._kept_waiting_ns * 1e-6,
+            }
         how = {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **real, **spin}
         return {**super().report(), "loop": how}
 
@@ -223,13 +231,26 @@ class CompiledMicron(Micron):
 
     def wait(self) -> Ticks | None:
         """See ``Micron.wait``: the thread runs the ticks in between; ``None`` where the loop must not wait any more."""
+        self._count_passed_over(self._may_command)  # by the ticks that Python has run since the last wait
         while (place := self._place_to_enter()) is not None:
             result = self._enter(*place)
+            self._count_passed_over(True)
             if result != at.SPENT:
                 break
+        self._may_command = self.run.supervisor.state is State.RUNNING and not self.run.scheduler.is_announced
         if self.run.supervisor.must_not_wait:  # found beside the thread: the ramp does not wait for the next scan
             return None
         return super().wait()
+
+    def _count_passed_over(self, may_command: bool) -> None:
+        """Count the scans that were passed over since the last call; ``may_command``: each could have had a command."""
+        before, self._passed_over_counted = self._passed_over_counted, self.run.scheduler.passed_over
+        if not self.entries:
+            return
+        if may_command:
+            self._passed_over += self._passed_over_counted - before
+        else:
+            self._passed_over_held += self._passed_over_counted - before
 
     def _place_to_enter(self) -> tuple[int, int, int] | None:
         """Return where the thread goes on, None while Python has to run the ticks."""
@@ -257,8 +278,6 @@ class CompiledMicron(Micron):
         if self._is_virtual:
             self._feed(last_due_ns)
         else:
-            if not self.entries:
-                self._passed_over_before = self.run.scheduler.passed_over
             self._kept_waiting_ns -= kept_waiting_ns()
         words[at.BEAT_NS] = self.run.clock.now_ns()
         words[at.ORDER] = (

@@ -18,20 +18,22 @@ Words = NDArray[np.int64]
     STALLED_NS, LATE_LIMIT_NS, STARTED_NS, END_NS, SPIN_NS, VERIFY_DIVIDER, VERIFY_PHASE, VERIFY_PATIENCE,
     VERIFY_END_NS,
     # where the thread is in the stream of scans
-    SEQ_OF_TICK0, LAST_K, LAST_DUE_NS, SILENT_AT_NS, SILENT_OF_NS,
+    SEQ_OF_TICK0, LAST_K, LAST_DUE_NS, SILENT_AT_NS, SILENT_OF_NS, WAITS_SINCE_NS,
     # the block under way, and how far it got
     BLOCK_N, BLOCK_T0_NS, BLOCK_SEQ, BLOCK_LOST, BLOCK_SHIFTED, VERDICT, DONE_ROW, DONE_STAGE, FOUND,
     # what the thread tells
     GAP_DUE_NS, GAP_NOW_NS, WARNED, PAIR_TOLD, RECEIVED, TICKS, CAUGHT_UP, COMMANDS, SUPERSEDED, CLIPPED, LATE_NS,
-    SCANS_LATE_NS, NOTES, ARRIVAL_NS, SPUN_NS, VERIFY_WAITED,
+    SCANS_LATE_NS, NOTES, ARRIVAL_NS, SPUN_NS, VERIFY_WAITED, BUSY,
     N_WORDS,
-) = range(51)  # fmt: skip
+) = range(53)  # fmt: skip
 """Places in ``Memory.words``.
 
 ``ORDER``: GO or CALLED_BACK; ``BEAT_NS``: when Python was last alive; ``FIXED_NS``: the time in virtual time, else
 REAL_TIME; ``READS_LEFT``: reads until the thread comes back by itself, negative for no limit. ``BLOCK_...``: what
 ``decode`` returned; ``DONE_ROW`` and ``DONE_STAGE``: the first row and stage of it that are not done. ``SILENT_OF_NS``:
-the ``LAST_DUE_NS`` for which ``SILENT_AT_NS`` holds: a wait has one limit, however often it is gone on with.
+the ``LAST_DUE_NS`` for which ``SILENT_AT_NS`` holds: a wait has one limit, however often it is gone on with;
+``WAITS_SINCE_NS``: when that wait began. ``BUSY``: scans, of ``CAUGHT_UP``, for which the thread did not wait yet when
+they came.
 ``LATE_NS`` and ``SCANS_LATE_NS``: when a command or scans were late for the first time, 0 for never; ``NOTES``:
 warnings so far. ``SPIN_NS``: how long before and after a scan is expected the thread waits awake; ``ARRIVAL_NS``:
 running median of the time from a scan's instant to its arrival; ``SPUN_NS``: time that was waited awake.

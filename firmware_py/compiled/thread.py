@@ -24,6 +24,7 @@ from firmware_py.compiled.memory import (
     BLOCK_SHIFTED,
     BLOCK_T0_NS,
     BUDGET_NS,
+    BUSY,
     CALLED,
     CAUGHT_UP,
     CLIPPED,
@@ -87,6 +88,7 @@ from firmware_py.compiled.memory import (
     VERIFY_PATIENCE,
     VERIFY_PHASE,
     VERIFY_WAITED,
+    WAITS_SINCE_NS,
     WAKE_FD,
     WARNED,
     Memory,
@@ -334,6 +336,15 @@ def count_skipped(m: Memory, n: int) -> None:
                 skipped[VERIFY] += 1
 
 
+@kernel
+def count_busy(words: Words) -> None:
+    """Count the scans of a block but for the newest that came before this thread waited for them. The others came, or
+    were given to this thread by the kernel, together with a newer one."""
+    for row in range(words[BLOCK_N] - 1):
+        if words[BLOCK_T0_NS] + row * words[DT_NS] + words[ARRIVAL_NS] < words[WAITS_SINCE_NS]:
+            words[BUSY] += 1
+
+
 @inlined_kernel
 def take_block(m: Memory) -> int:
     """Run the block that was decoded, and count it. Return GO, GAP, or why Python must go on."""
@@ -343,6 +354,7 @@ def take_block(m: Memory) -> int:
         return SCANS
     if n > 1 and words[SCANS_LATE_NS] == 0:
         words[SCANS_LATE_NS] = awake_ns
+    count_busy(words)
     result = run_block(m)
     if result != GO:
         return result
@@ -422,6 +434,7 @@ def serve(m: Memory) -> int:
         if words[SILENT_OF_NS] != words[LAST_DUE_NS]:  # a wait begins; bytes without a scan do not prolong it
             words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
             words[SILENT_OF_NS] = words[LAST_DUE_NS]
+            words[WAITS_SINCE_NS] = now
         polls[0], polls[1] = poll_word(words[DAQ_FD], POLLIN), poll_word(words[WAKE_FD], POLLIN)
         ready = 0
         if words[SPIN_NS] > 0 and words[FIXED_NS] == REAL_TIME:

@@ -91,28 +91,9 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     can = _CanBuses(bench)
     amplifier: ProbedOutput = open_device(bench, piezo_name, options[piezo_name], can=can)
     probe(piezo_name, amplifier.probe)
-    magnetometer = None
-    for name, spec in description.devices_with("hmc2003").items():
-        magnetometer_options: Hmc2003Options = options[name]
-        adc = _adc(bench, spec.adc or "", options)
-        probe(adc.name, adc.probe)
-        magnetometer = Hmc2003(adc, daq, bench.clock, magnetometer_options.channels, name=name)
-    monitor = None
-    for name, spec in description.devices_with("amplifier_monitor").items():
-        monitor_options: AmplifierMonitorOptions = options[name]
-        adc = _adc(bench, spec.adc or "", options)
-        probe(adc.name, adc.probe)
-        monitor = AmplifierMonitor(
-            adc, _guard_of(amplifier, where, name), bench.clock, monitor_options.channels, ratio=monitor_options.ratio,
-            tolerance_V=monitor_options.tolerance_V, settle_s=monitor_options.settle_ms * 1e-3,
-            change_V=monitor_options.change_V, name=name,
-        )  # fmt: skip
-    telemetry = None
-    for name, spec in description.devices_with("can_telemetry").items():
-        bus = _bus(spec)
-        telemetry = CanTelemetry(
-            can.view(bus, CanTelemetry.receives()), bench.clock, heartbeat=can.heartbeat(bus), name=name
-        )
+    magnetometer = _open_magnetometer(bench, options, daq, probes)
+    monitor = _open_monitor(bench, options, amplifier, probes)
+    telemetry = _open_telemetry(bench, can)
     for name, spec in description.device.items():
         if spec.bus is not None and find_driver(spec.driver).role == "sensor":
             probe(name, lambda name=name: open_device(bench, name, options[name]).probe())
@@ -123,23 +104,60 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     )
     sensing = sensing_table(options, scan.channels, scan.rate_hz, scan.lsb_V[0], where)
     if magnetometer is not None:
-        # set and reset pulses reveal the bridge's present offset; the DAQ takes no commands while it scans
-        try:
-            for _ in magnetometer.measure_offset():
-                wait_s(bench.clock, 0.001)
-        except HalError as error:
-            raise name_device(error, magnetometer.name) from error.__cause__
+        _measure_offset(magnetometer, bench)
         sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
-    labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in _axes(options))
-    labels += tuple(
-        f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature") if name in options
-    )
     verify = amplifier.verify if isinstance(amplifier, DacOutput) else None
     polling, bus_us = bus_plan(description, options)
     return Devices(
-        daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, probes.identities,
-        polling=polling, bus_us=bus_us,
+        daq, scan, amplifier, magnetometer, telemetry, sensing, _scan_labels(options), verify, monitor,
+        probes.identities, polling=polling, bus_us=bus_us,
     )  # fmt: skip
+
+
+def _open_magnetometer(bench: OpenBench, options: Mapping[str, Any], daq: Daq, probes: Probes) -> Hmc2003 | None:
+    if (name := _at_most_one(bench, "hmc2003")) is None:
+        return None
+    own: Hmc2003Options = options[name]
+    adc = _probed_adc(bench, name, options, probes)
+    return Hmc2003(adc, daq, bench.clock, own.channels, name=name)
+
+
+def _open_monitor(
+    bench: OpenBench, options: Mapping[str, Any], amplifier: AnalogOutput, probes: Probes
+) -> AmplifierMonitor | None:
+    if (name := _at_most_one(bench, "amplifier_monitor")) is None:
+        return None
+    own: AmplifierMonitorOptions = options[name]
+    adc = _probed_adc(bench, name, options, probes)
+    guard = _guard_of(amplifier, str(bench.file.path), name)
+    return AmplifierMonitor(
+        adc, guard, bench.clock, own.channels, ratio=own.ratio, tolerance_V=own.tolerance_V,
+        settle_s=own.settle_ms * 1e-3, change_V=own.change_V, name=name,
+    )  # fmt: skip
+
+
+def _open_telemetry(bench: OpenBench, can: _CanBuses) -> CanTelemetry | None:
+    if (name := _at_most_one(bench, "can_telemetry")) is None:
+        return None
+    bus = _bus(bench.file.description.device[name])
+    frames = can.view(bus, CanTelemetry.receives())
+    return CanTelemetry(frames, bench.clock, heartbeat=can.heartbeat(bus), name=name)
+
+
+def _measure_offset(magnetometer: Hmc2003, bench: OpenBench) -> None:
+    """Measure the bridge's present offset by set and reset pulses. A DAQ that scans takes no commands: before it."""
+    try:
+        for _ in magnetometer.measure_offset():
+            wait_s(bench.clock, 0.001)
+    except HalError as error:
+        raise name_device(error, magnetometer.name) from error.__cause__
+
+
+def _scan_labels(options: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a name for each used input of a scan, with its DAQ input, for messages."""
+    labels = [f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in _axes(options)]
+    others = [name for name in ("supply", "temperature") if name in options]
+    return (*labels, *(f"{name} (DAQ input {options[name].channel})" for name in others))
 
 
 def bus_plan(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, dict[str, float]]:
@@ -156,11 +174,27 @@ def _only(description: BenchDescription, role: Role, what: str, where: str) -> s
     return found[0]
 
 
-def _adc(bench: OpenBench, name: str, options: Mapping[str, Any]) -> Ads1115:
-    adc_options: Ads1115Options = options[name]
-    spec = bench.file.description.device[name]
-    full_scale_V = adc_options.full_scale_V
-    return Ads1115(bench.i2c(_bus(spec)), bench.clock, spec.address or 0x48, full_scale_V=full_scale_V, name=name)
+def _at_most_one(bench: OpenBench, driver: str) -> str | None:
+    """Return the name of the device with this driver, None without one. Raises ``BenchError`` for several."""
+    found = list(bench.file.description.devices_with(driver))
+    if len(found) > 1:
+        raise BenchError(
+            f"{bench.file.path}: [device] the instrument reads one {driver}, this bench has {', '.join(found)}; "
+            "remove all but one"
+        )
+    return found[0] if found else None
+
+
+def _probed_adc(bench: OpenBench, reader: str, options: Mapping[str, Any], probes: Probes) -> Ads1115:
+    """Open and probe the ADC through which the device ``reader`` is read."""
+    devices = bench.file.description.device
+    name = devices[reader].adc or ""
+    own: Ads1115Options = options[name]
+    spec = devices[name]
+    bus = bench.i2c(_bus(spec))
+    adc = Ads1115(bus, bench.clock, spec.address or 0x48, full_scale_V=own.full_scale_V, name=name)
+    probes.probe(name, adc.probe)
+    return adc
 
 
 def _guard_of(amplifier: AnalogOutput, where: str, name: str) -> OutputGuard:

@@ -32,5 +32,5 @@ LAYOUT = Layout("endoscope", _QUANTITIES, plotted=("psi", "theta", "view_x", "vi
 TICK, TIME = LAYOUT.start("tick"), LAYOUT.start("t")
 ACCEL, GYRO, TEMPERATURE = LAYOUT.start("accel"), LAYOUT.start("gyro"), LAYOUT.start("temperature")
 CARD_STATUS, FUSED, HELD = LAYOUT.start("card_status"), LAYOUT.start("fused"), LAYOUT.start("held")
-OUTPUTS = STATUS = LAYOUT.start("status")
+OUTPUTS = LAYOUT.start("status")
 USED, QUATERNION, PSI, VIEW = (LAYOUT.start(name) for name in ("used", "quaternion", "psi", "view_x"))

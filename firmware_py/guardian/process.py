@@ -40,7 +40,6 @@ END_POLL_S = 0.002
 REPORT = "guardian.json"
 STARTED = "guardian.started"
 """There is a guardian; the file holds the seconds for which it may try to reach neutral."""
-_ROOT = Path(__file__).resolve().parents[2]
 
 
 class GuardianProcess:
@@ -182,9 +181,11 @@ def main(arguments: list[str]) -> int:
         retry_s=order["retry_s"],
         end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
     )  # fmt: skip
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
     with realtime(RealtimeConfig(priority=PRIORITY)):
+        # not before: from its word on a guardian that is silent for 100 ms counts as lost, and the settings may take so
+        # long on a busy machine
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
         serve(guardian, order["pipe"], heart.mark)
     report = guardian.report()
     partial = Path(order["report"] + ".partial")

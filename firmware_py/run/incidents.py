@@ -98,7 +98,8 @@ class Incidents:
     def bad_for(self, finding: Finding, bad: bool, t_ns: int, patience_ms: float, **words: object) -> None:
         """Report ``finding`` when ``bad`` has held for ``patience_ms``; where nothing is armed, notice it only."""
         if not bad:
-            self._bad_since.pop(finding, None)
+            if self._bad_since:
+                self._bad_since.pop(finding, None)
         elif (t_ns - self._bad_since.setdefault(finding, t_ns)) * 1e-6 >= patience_ms:
             if self._supervisor.state is State.SENSING_ONLY:
                 self.notice(f"{finding.value.title}: beyond its limit")

@@ -115,6 +115,7 @@ class Scheduler:
         late = [task for task in self._tasks if task.catch_up]
         self._due_late = [self._due_at(index, late) for index in range(self._hyperperiod)]
         self._due_beside: dict[tuple[str, ...], list[int]] = {}  # ticks of the hyperperiod, by the tasks left out
+        self._released: dict[tuple[int, int, tuple[str, ...]], tuple[tuple[_LiveTask, int], ...]] = {}
         self._waiting: list[_LiveTask] = []  # put off to the next full tick
         self._done_by_ns = round(LATEST_END * period_ns)
         self._last_scan: int | None = None  # newest tick that the catch_up tasks have seen
@@ -198,9 +199,7 @@ class Scheduler:
         ``run``; else each task runs once, and none is deferred."""
         info = TickInfo(k, due_ns, self._now_ns(), 0)
         due: list[_LiveTask] = []
-        for task in self._tasks:
-            if task.spec.name in others or not (releases := task.releases(first, k + 1)):
-                continue
+        for task, releases in self._releases_beside(first, k, others):
             if in_tick and k % task.spec.divider != task.spec.phase:
                 task.skipped += releases
             else:
@@ -210,6 +209,18 @@ class Scheduler:
         if in_tick and self._waiting:
             tasks = self._with_waiting(tasks, others)
         self._run(tasks, info, info, beside=True, may_defer=in_tick)
+
+    def _releases_beside(self, first: int, k: int, others: Collection[str]) -> tuple[tuple[_LiveTask, int], ...]:
+        """Return the tasks except ``others`` that are due in the ticks ``first`` .. ``k``, each with how often. It is
+        looked up, because passes beside a compiled loop are short and many."""
+        key = first % self._hyperperiod, k - first, tuple(others)
+        released = self._released.get(key)
+        if released is None:
+            each = ((task, task.releases(first, k + 1)) for task in self._tasks if task.spec.name not in others)
+            released = tuple((task, releases) for task, releases in each if releases)
+            if k - first < self._hyperperiod:
+                self._released[key] = released
+        return released
 
     def next_beside(self, k: int, others: Collection[str]) -> int:
         """Return the first tick after ``k`` in which ``run_beside`` has something to run."""

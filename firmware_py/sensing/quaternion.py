@@ -11,15 +11,6 @@ from hal.compiled import kernel
 
 
 @kernel
-def multiply(p: NDArray[np.float64], q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Set ``out`` to p x q (Hamilton). ``out`` must be another array."""
-    out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
-    out[1] = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
-    out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
-    out[3] = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
-
-
-@kernel
 def rotate_by(q: NDArray[np.float64], x: float, y: float, z: float) -> None:
     """q <- q x exp(theta/2) in place: turn by the body-frame rotation vector (x, y, z) rad, and renormalise."""
     angle2 = x * x + y * y + z * z

@@ -17,8 +17,6 @@ from sim_devices.plant.kernel import NOISES, SLOW_NOISES, STEPS_PER_MS, TRUTH, T
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
 
-Array = NDArray[np.float64]
-
 
 class PlantBlocks:
     """Computes one run of one instrument in one hand, in blocks of ``ms`` milliseconds (a multiple of ``BLOCK_MS``).

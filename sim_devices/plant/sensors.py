@@ -21,13 +21,11 @@ from sim_devices.plant.streams import stream
 
 Array = NDArray[np.float64]
 
-AXES = ("a1x", "a1z", "a2y", "a2z", "a3x", "a3y")
 LOCATION = (0, 0, 1, 1, 2, 2)
 DIRECTION = (0, 2, 1, 2, 0, 1)
 IN_PLANE = (2, 0, 2, 1, 1, 0)
 OUT_OF_PLANE = (1, 1, 0, 0, 2, 2)
 STANDARD_GRAVITY = 9.80665
-REFERENCE_C = 25.0
 
 ACCELEROMETER = np.dtype(
     [

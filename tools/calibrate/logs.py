@@ -1,7 +1,6 @@
-"""Sensor logs: whatever a recording of the contract may be, with or without its descriptor, and our own recordings.
+"""Reads sensor logs: a folder (recording.toml, meta.toml or data.npz in it), a descriptor, or a data file alone.
 
-A folder (recording.toml, meta.toml or data.npz in it), a descriptor, or a data file of any format that
-``recording_columns`` reads. Arrays of two dimensions in an .npz become columns ``name_0``, ``name_1``, ...
+A data file has any format that ``recording_columns`` reads, recordings of ``micron run`` among them.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hal.npz import open_npz
 from tools.errors import InputError
 from tools.mismatch.recording_columns import SUFFIXES, column_names, column_units, read_columns
 
@@ -69,15 +67,11 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
     meta = _toml(descriptor) if descriptor is not None else {}
     channels = [c for c in meta.get("channels", []) if isinstance(c, dict) and isinstance(c.get("column"), str)]
     units = {str(c["column"]): str(c["unit"]) for c in channels if "unit" in c}
-    if file.suffix.lower() == ".npz":
-        columns = _npz(file)
-    elif file.suffix.lower() == ".mcap" and (own := _own_recording(file)) is not None:
-        columns, units = own
-    else:
-        columns = read_columns(file, column_names(file))
-        units = {**column_units(file), **units}
-    if not columns:
-        raise InputError(f"{file}: holds no columns")
+    names = column_names(file)
+    if not names:
+        raise InputError(f"{file}: holds no columns of numbers")
+    columns = read_columns(file, names)
+    units = {**column_units(file), **units}
     named = meta.get("time_column")
     time = named if isinstance(named, str) else next((name for name in TIMES if name in columns), None)
     if time is None:
@@ -99,7 +93,7 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
 
 
 def _find(path: Path) -> tuple[Path, Path | None]:
-    """Return the data file and its descriptor."""
+    """Return the data file and its descriptor: a ``recording.toml`` that names it, or the ``meta.toml`` of a set."""
     if path.is_dir():
         for name in ("recording.toml", "meta.toml"):
             if (path / name).is_file():
@@ -107,8 +101,10 @@ def _find(path: Path) -> tuple[Path, Path | None]:
         return path / "data.npz", None
     if path.suffix.lower() == ".toml":
         return _data(path), path
-    beside = next((p for p in (path.parent / n for n in ("recording.toml", "meta.toml")) if p.is_file()), None)
-    return path, beside
+    descriptor, about_all = path.parent / "recording.toml", path.parent / "meta.toml"
+    if descriptor.is_file() and _data(descriptor) == path:
+        return path, descriptor
+    return path, about_all if about_all.is_file() else None
 
 
 def _data(descriptor: Path) -> Path:
@@ -125,36 +121,3 @@ def _toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
-
-
-def _npz(file: Path) -> dict[str, Array]:
-    try:
-        with open_npz(file) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read as .npz ({error})") from error
-    arrays = {name: a for name, a in arrays.items() if a.dtype.kind in "fiub"}
-    lengths = {len(a) for a in arrays.values() if a.ndim == 1 or (a.ndim == 2 and a.shape[1] <= 16)}
-    if not lengths:
-        raise InputError(f"{file}: holds no columns (arrays of one dimension, or two with up to 16 columns)")
-    length = max(lengths)
-    columns = {
-        name: array.astype(np.float64) for name, array in arrays.items() if array.ndim == 1 and len(array) == length
-    }
-    for name, array in arrays.items():
-        if array.ndim == 2 and len(array) == length and array.shape[1] <= 16:
-            columns.update({f"{name}_{i}": array[:, i].astype(np.float64) for i in range(array.shape[1])})
-    return columns
-
-
-def _own_recording(file: Path) -> tuple[dict[str, Array], dict[str, str]] | None:
-    """Columns and units of a recording that ``micron run`` made; None when the file is another MCAP."""
-    from firmware_py.recording.errors import RecordingError
-    from firmware_py.recording.reader import Recording
-
-    try:
-        recording = Recording(file)
-    except (RecordingError, OSError):
-        return None
-    columns = {name: np.asarray(values) for name, values in recording.arrays().items()}
-    return columns, {name: recording.unit(name) for name in columns}

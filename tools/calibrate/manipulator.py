@@ -84,11 +84,11 @@ def rest_heights(circle_m: float, ax: float, ay: float) -> Array:
     return circle_m * np.array([-ax, 0.5 * ax - half * ay, 0.5 * ax + half * ay])
 
 
-def identify_manipulator(data: dict[str, Array], start: ActuationConfig | None = None) -> ManipulatorFit:
+def identify_manipulator(data: dict[str, Array]) -> ManipulatorFit:
     """Fit all ten parameters to columns ``stroke_um`` and ``tip_um`` (n, 3) of a scan.
 
     Raises ``InputError`` when the scan does not determine them."""
-    config = start or ActuationConfig()
+    config = ActuationConfig()
     stroke, tip = data["stroke_um"], data["tip_um"]
     if len(tip) < LEAST_POSITIONS:
         raise InputError(f"{len(tip)} positions: at least {LEAST_POSITIONS} are needed, a grid of 3 x 3 x 3 is better")

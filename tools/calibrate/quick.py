@@ -14,6 +14,7 @@ from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
 from tools.calibrate.multi_position import Estimate, missing_poses
+from tools.calibrate.still import spread
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -28,6 +29,15 @@ LARGEST_FLAT_BIAS_G = 0.5
 LEAST_REACH = 0.8
 """Range of an axis over the largest; an axis 35 degrees from the vertical still reads 0.82 g."""
 POSE_SINE = float(np.sin(np.radians(35.0)))
+FALL_G = 0.5
+"""Size of the reading below which a free fall is searched."""
+SHORTEST_FALL_S, LONGEST_FALL_S = 0.05, 2.0
+BOUNCE_S = 0.005
+"""A disturbance shorter than this does not end a fall."""
+NEAR_G = 0.1
+"""Largest distance of a reading from the quietest part of a fall."""
+EDGE_SHARE = 0.1
+"""Part of a fall that is left out at either end."""
 UNDITHERED_STEPS = 0.475
 """Half of 95 % of one quantisation step: what a mean of equal readings can be off by."""
 
@@ -164,14 +174,14 @@ def turn(raw: Array) -> QuickResult:
     bias, scale = (up + down) / 2.0, (up - down) / 2.0
     missing = _missing_turns(raw, low, high, bias, scale)
     axes = [i for i, axis in enumerate("xyz") if not any(pose[0] == axis for pose in missing)]
-    spread = 1.4826 * np.hypot(np.median(np.abs(top - up), axis=0), np.median(np.abs(bottom - down), axis=0))
+    scatter = 1.4826 * np.hypot(np.median(np.abs(top - up), axis=0), np.median(np.abs(bottom - down), axis=0))
     if len(axes) < 2:
         raise InputError(f"missing: {', '.join(missing)}: turn slowly through 360 degrees about two axes")
     wide = float(student.ppf(0.975, len(low) - 1))
     parameters: dict[str, Estimate] = {}
     for i in axes:
-        # the spread itself, not that of a mean: an extreme is passed and not held, and its flank reads less
-        error = max(wide * float(spread[i]) / 2.0, UNDITHERED_STEPS * step)
+        # the scatter itself, not that of a mean: an extreme is passed and not held, and its flank reads less
+        error = max(wide * float(scatter[i]) / 2.0, UNDITHERED_STEPS * step)
         for name, value in ((f"bias_{'xyz'[i]}", float(bias[i])), (f"scale_{'xyz'[i]}", float(scale[i]))):
             parameters[name] = Estimate(value, value - error, value + error)
     rest = np.ones(len(raw), dtype=bool)
@@ -201,30 +211,65 @@ def turn(raw: Array) -> QuickResult:
     design = np.kron(np.eye(len(axes)), [[1.0, 1.0], [1.0, -1.0]]).astype(
         np.float64
     )  # reading up and down = bias +- scale
-    noise = float(np.max(spread[axes])) / np.sqrt(2.0)
+    noise = float(np.max(scatter[axes])) / np.sqrt(2.0)
     return _exact("turn", parameters, design, len(raw), noise, missing, limits=tuple(limits), check=check)
 
 
-def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float = 2.0) -> QuickResult:
-    """Return the offset of every axis (n, 3) in free fall: the longest run below 0.35 g, ends trimmed."""
-    force = raw / counts_per_g
-    weightless = np.concatenate([[False], np.linalg.norm(force, axis=1) < 0.35, [False]])
-    bounds = np.flatnonzero(np.diff(weightless.astype(np.int8))).reshape(-1, 2)
-    if len(bounds) == 0:
-        raise InputError("no free fall: |a| never stays below 0.35 g")
-    first, last = bounds[np.argmax(bounds[:, 1] - bounds[:, 0])]
+def _runs(here: NDArray[np.bool_], bridge: int = 0) -> list[tuple[int, int]]:
+    """Return (start, stop) of the runs of True; gaps of fewer than ``bridge`` samples are closed."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(np.int8))).reshape(-1, 2)
+    runs: list[tuple[int, int]] = []
+    for start, stop in edges.tolist():
+        if runs and start - runs[-1][1] < bridge:
+            runs[-1] = (runs[-1][0], stop)
+        else:
+            runs.append((start, stop))
+    return runs
+
+
+def find_fall(force_g: Array, rate_hz: float) -> tuple[int, int] | None:
+    """Return the samples (first, last + 1) of the longest free fall of at least 50 ms in readings (n, 3), or None.
+
+    A fall is searched where |a| is below half of 1 g. It is what stays within 0.1 g of the quietest 50 ms there: the
+    resistance of a liquid, a rope or the air that grows afterwards ends it. A rebound of less than 5 ms (what held the
+    sensor lets go with a jerk) does not.
+    """
+    shortest = max(3, round(SHORTEST_FALL_S * rate_hz))
+    best: tuple[int, int] | None = None
+    for start, stop in _runs(np.linalg.norm(force_g, axis=1) < FALL_G):
+        if stop - start < shortest:
+            continue
+        quiet = start + int(np.argmin(spread(force_g[start:stop], shortest)))
+        around = force_g[max(start, quiet - shortest // 2) : quiet + shortest // 2 + 1]
+        off = np.linalg.norm(force_g - np.median(around, axis=0), axis=1)
+        for run in _runs(off < NEAR_G, max(1, round(BOUNCE_S * rate_hz))):
+            longest = shortest if best is None else best[1] - best[0] + 1
+            if run[0] <= quiet < run[1] and run[1] - run[0] >= longest:
+                best = run
+    return best
+
+
+def inside_fall(fall: tuple[int, int]) -> slice:
+    """Return the samples of a fall without a tenth at either end."""
+    margin = round(EDGE_SHARE * (fall[1] - fall[0]))
+    return slice(fall[0] + margin, fall[1] - margin)
+
+
+def free_fall(raw: Array, rate_hz: float, counts_per_g: float) -> QuickResult:
+    """Return the offset of every axis (n, 3) in free fall, ends left out."""
+    fall = find_fall(raw / counts_per_g, rate_hz)
+    if fall is None:
+        raise InputError(f"no free fall: |a| never stays below {FALL_G:g} g for {1e3 * SHORTEST_FALL_S:.0f} ms")
     missing = ["x up or down", "y up or down", "z up or down"]
-    if first == 0:
+    if fall[0] == 0:
         missing.append("the rest before the fall")
-    trim = (last - first) // 10
-    first, last = first + trim, last - trim
-    if last - first < 16:
-        raise InputError(f"the longest fall has {last - first} samples after trimming; 16 are needed: drop from higher")
-    if (last - first) / rate_hz > longest_s:
+    part = raw[inside_fall(fall)]
+    if len(part) < 16:
+        raise InputError(f"the longest fall has {len(part)} samples without its ends; 16 are needed: drop from higher")
+    if len(part) / rate_hz > LONGEST_FALL_S:
         raise InputError(
-            f"|a| is below 0.35 g for {(last - first) / rate_hz:.1f} s: that is no fall; check --counts-per-g"
+            f"|a| is below {FALL_G:g} g for {len(part) / rate_hz:.1f} s: that is no fall; check --counts-per-g"
         )
-    part = raw[first:last]
     limits = ("scale: 0 g does not show it", "drag of the air and tumbling: they look like bias")
     return _exact(
         "fall", _one_pose(part), np.eye(3), len(part), float(part.std(axis=0).max()), tuple(missing), limits=limits

@@ -54,8 +54,10 @@ def sensors(
             out, calibration_toml("sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
         )
         table = table_of(
-            f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %", "axis", "bias (V)",
-            "scale (V/g)", "bias with in-plane, out-of-plane (mg/g^2)", "rms: line, model, left out (mV)", left=0,
+            f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %; bias with in-plane "
+            "and out-of-plane force in mg/g^2; rms of the line, of the model and of poses left out in mV",
+            "axis", "bias (V)", "V/g", "in-plane", "out-of-plane", "line", "model", "left out",
+            box=None, pad_edge=False, padding=(0, 1, 0, 0),
         )  # fmt: skip
         for name, axis in zip(SENSORS, result.accelerometers.axes, strict=True):
             cross = [axis.parameters[key] for key in ("in_plane_2", "out_of_plane_2")]
@@ -64,8 +66,8 @@ def sensors(
                 name,
                 f"{bias.value:.5f} +- {bias.high - bias.value:.5f}",
                 f"{axis.scale_V_per_g:.5f}",
-                ", ".join(f"{1e3 * e.value:.2f} +- {1e3 * (e.high - e.value):.2f}" for e in cross),
-                f"{1e3 * axis.linear_rms_V:.3f}, {1e3 * axis.residual_rms_V:.3f}, {1e3 * axis.held_out_rms_V:.3f}",
+                *(f"{1e3 * e.value:.2f} +- {1e3 * (e.high - e.value):.2f}" for e in cross),
+                *(f"{1e3 * rms:.3f}" for rms in (axis.linear_rms_V, axis.residual_rms_V, axis.held_out_rms_V)),
             )
         console().print(table)
         offset = result.magnetometer.offset_V

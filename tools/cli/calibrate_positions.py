@@ -53,15 +53,12 @@ def positions(
         table = table_of(
             f"{fit.seconds:.0f} s, {fit.turning_rad_s:.2f} rad/s rms, condition {fit.condition:.0f}, residual "
             f"{1e3 * fit.residual_m_s2:.2f} mm/s^2; intervals of 95 %",
-            "place", "believed (mm)", "found (mm)", "moved by (mm)",
+            "place", "axis", "believed (mm)", "found (mm)", "moved by (mm)", left=2,
         )  # fmt: skip
         for name, before, place, reach in zip(fit.names, fit.believed, fit.places, fit.reach, strict=True):
-            table.add_row(
-                name,
-                ", ".join(f"{1e3 * v:.2f}" for v in before),
-                ", ".join(f"{1e3 * v:.3f} +- {1e3 * r:.3f}" for v, r in zip(place, reach, strict=True)),
-                ", ".join(f"{1e3 * (v - b):+.3f}" for v, b in zip(place, before, strict=True)),
-            )
+            for axis, was, value, half in zip("xyz", 1e3 * before, 1e3 * place, 1e3 * reach, strict=True):
+                named = name if axis == "x" else ""
+                table.add_row(named, axis, f"{was:.2f}", f"{value:.3f} +- {half:.3f}", f"{value - was:+.3f}")
         data_console().print(table)
         if out is not None:
             made_by = f"micron calibrate positions {recording} --bench {bench}"

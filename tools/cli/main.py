@@ -216,8 +216,7 @@ def options(
     micron bench: its page in a browser
     micron COMMAND --help: each command, with an example
 
-    Ctrl-C stops any command: what was measured is printed and written, the exit status is 130. A second one ends it
-    at once.
+    Ctrl-C stops a command: what was measured is printed and written (exit status 130). Twice, it ends at once.
     """
 
 

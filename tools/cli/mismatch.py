@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 # each command imports its modules itself, so that `micron --help` does not wait for the engine
 
 app = typer.Typer(help="Find where a simulation and a recording differ, and which physics the simulation lacks.")
-app.command()(watch)
-app.command()(plan)
-app.command()(heal)
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")
@@ -48,7 +45,6 @@ MOST_SHARED = 1_000_000
 """Samples above which one process works alone: every further one would hold a gigabyte of columns of its own."""
 
 
-@app.command()
 def diagnose(
     *,
     recordings: RecordingsArgument,
@@ -192,7 +188,6 @@ def _diagnose_folder(
         raise typer.Exit(Exit.BAD_INPUT if all(row.bad_input for row in bad) else Exit.FAILED)
 
 
-@app.command()
 def new(
     *,
     data: Annotated[Path, typer.Argument(metavar="DATA", help="A data file: .csv, .txt, .npz, .mat and others.")],
@@ -254,7 +249,6 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
     console().print(f"next: micron mismatch diagnose {shlex.quote(str(made.path))}", soft_wrap=True)
 
 
-@app.command()
 def physics(json_file: JsonOption = None) -> None:
     """List every effect of the vocabulary with formula, parameters, source, and the excitation that shows it.
 
@@ -270,7 +264,6 @@ def physics(json_file: JsonOption = None) -> None:
         write_json(to_json(effects), json_file)
 
 
-@app.command()
 def cut(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml).")],
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],
@@ -297,7 +290,6 @@ def cut(
         )
 
 
-@app.command()
 def apply(
     *,
     recording: RecordingArgument,
@@ -362,7 +354,6 @@ def apply(
             console().print(f"{copy}: {original.path} with it; try: micron run --bench {copy}", soft_wrap=True)
 
 
-@app.command()
 def simulate(
     twin: Annotated[
         Path, typer.Argument(metavar="TWIN", help="Corrected twin that 'apply' wrote: .toml, .py or .fmu.")
@@ -393,3 +384,7 @@ def simulate(
         for row in rows:
             say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}", highlight=False)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
+
+
+for _command in (new, diagnose, apply, simulate, plan, watch, heal, cut, physics):  # in the order of their use
+    app.command()(_command)

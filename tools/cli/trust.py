@@ -73,9 +73,13 @@ def trust(
             console().print(f"{forget_all()} decisions dropped")
             return
         if not paths:
+            days: dict[tuple[str, str], list[str]] = {}
             for decision in decisions():
-                what = "may run" if decision.act == "run" else "may be named"
-                data_console().print(f"{decision.day} {what}: {decision.label}", soft_wrap=True)
+                days.setdefault((decision.act, decision.label), []).append(decision.day)
+            for (act, label), dates in days.items():
+                what = "may run" if act == "run" else "may be named"
+                versions = f" ({len(dates)} versions)" if len(dates) > 1 else ""
+                data_console().print(f"{dates[-1]} {what}: {label}{versions}", soft_wrap=True)
             console().print(f"kept in {decisions_file()}", soft_wrap=True)
             return
         from tools.programs import Program, named_in

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError as OwnRecordingError
-from firmware_py.recording.reader import Recording
-from hal.npz import NpzError, open_npz
 from tools.errors import InputError, RecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 
@@ -38,7 +36,7 @@ def read_stimulus(text: str) -> Stimulus:
     path = Path(file)
     try:
         columns = _columns(path, column, needs_time=rate is None)
-    except (RecordingError, OwnRecordingError, NpzError, OSError) as error:
+    except (RecordingError, OwnRecordingError, OSError) as error:
         raise InputError(f"--stimulus {text}: {error}") from error
     values = columns[column]
     if rate is not None:
@@ -62,29 +60,10 @@ def _number(text: str) -> float:
 
 
 def _columns(path: Path, column: str, *, needs_time: bool) -> dict[str, NDArray[np.float64]]:
-    own = _own_recording(path)
-    names = own.names if own is not None else _names(path)
+    names = column_names(path)
     time = next((name for name in TIMES if name in names and name != column), None)
     if needs_time and time is None:
         raise RecordingError(
             f"{path}: no time column ({', '.join(TIMES)}); add its rate in Hz, {path.name}:{column}@1000"
         )
-    wanted = [column] if time is None or not needs_time else [column, time]
-    return {name: own.column(name) for name in wanted} if own is not None else read_columns(path, wanted)
-
-
-def _own_recording(path: Path) -> Recording | None:
-    """Return the recording of ours at ``path``, or ``None`` where it is a file of another program."""
-    if path.suffix.lower() != ".mcap":
-        return None
-    try:
-        return Recording(path)
-    except OwnRecordingError:
-        return None
-
-
-def _names(path: Path) -> list[str]:
-    if path.suffix.lower() == ".npz" and path.is_file():
-        with open_npz(path) as archive:
-            return archive.files
-    return column_names(path)
+    return read_columns(path, [column] if time is None or not needs_time else [column, time])

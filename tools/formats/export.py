@@ -60,24 +60,13 @@ def export(recording: Recording, out: Path, format: str | None = None, *, overwr
     return ExportReport(out, chosen, recording.n_rows, len(recording.columns), notes)
 
 
-def export_folder(
-    recording: Recording,
-    out: Path,
-    *,
-    data: str = "npz",
-    kind: str = "instrument",
-    parameters: Mapping[str, object] | None = None,
-    roles: Mapping[str, str] | None = None,
-) -> ExportReport:
+def export_folder(recording: Recording, out: Path) -> ExportReport:
     """Write the recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
 
-    ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
-    DAQ outputs, and the rest, computed from these volts with their noise, no channels. Flags, and columns that are
-    not finite throughout, are no channels either. The bench description stored in the recording becomes
-    ``bench.toml`` and the twin's ``bench``.
+    The commands are inputs, the volts of the DAQ outputs; the rest, computed from these volts with their noise, is no
+    channel. Flags, and columns that are not finite throughout, are no channels either. The bench description stored in
+    the recording becomes ``bench.toml`` and the twin's ``bench``.
     """
-    if data not in ("npz", "csv"):
-        raise RecordingError(f"{out}: the data file is npz or csv, not {data!r}")
     refuse_existing(out, overwrite=False)
     finite = _finite_columns(recording)
     channels, notes = [], []
@@ -90,7 +79,7 @@ def export_folder(
         elif not finite[index]:
             notes.append(f"{name} is not a finite number throughout: it is in the data, but no channel")
         else:
-            role = roles.get(name, "context") if roles is not None else _default_role(name)
+            role = next((r for prefix, r in _ROLES if name == prefix or name.startswith(f"{prefix}_")), None)
             if role is None:
                 computed += 1
                 continue
@@ -104,28 +93,20 @@ def export_folder(
                 "Export it as csv and describe that with 'micron mismatch new'"
             )
     bench = recording.metadata.get("bench")
-    twin: dict[str, object] = dict(parameters or {})
+    parameters: dict[str, object] = {}
     with new_folder(out) as folder:
         if isinstance(bench, str):
             (folder / "bench.toml").write_text(bench, encoding="utf-8")
-            twin.setdefault("bench", "bench.toml")
-        (_npz if data == "npz" else _csv)(recording, folder / f"data.{data}")
-        text = _descriptor(recording, data, kind, twin, channels)
+            parameters["bench"] = "bench.toml"
+        _npz(recording, folder / "data.npz")
+        clock = (
+            {"time_column": fmt.TIME_COLUMN} if fmt.TIME_COLUMN in recording.names else {"rate_hz": recording.tick_hz}
+        )
+        head = {"format": 1, "title": recording.path.stem, "data": "data.npz", **clock}
+        twin = {"kind": "instrument", "parameters": parameters}
+        text = toml_text({**head, "twin": twin, "channels": channels})
         (folder / "recording.toml").write_text(text, encoding="utf-8")
     return ExportReport(out, "folder", recording.n_rows, len(recording.columns), tuple(notes))
-
-
-def _default_role(name: str) -> str | None:
-    return next((role for prefix, role in _ROLES if name == prefix or name.startswith(f"{prefix}_")), None)
-
-
-def _descriptor(
-    recording: Recording, data: str, kind: str, twin: Mapping[str, object], channels: list[dict[str, str]]
-) -> str:
-    timed = fmt.TIME_COLUMN in recording.names
-    clock = {"time_column": fmt.TIME_COLUMN} if timed else {"rate_hz": recording.tick_hz}
-    head = {"format": 1, "title": recording.path.stem, "data": f"data.{data}", **clock}
-    return toml_text({**head, "twin": {"kind": kind, "parameters": twin}, "channels": channels})
 
 
 def _finite_columns(recording: Recording) -> np.ndarray:

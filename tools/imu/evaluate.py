@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from hal.types import STANDARD_GRAVITY
+from tools.calibrate.quick import find_fall, inside_fall
 from tools.errors import InputError
-from tools.imu.offsets import free_fall, gyroscope_mean, manual, moved, simple
+from tools.imu.offsets import gyroscope_mean, manual, moved, simple
 from tools.imu.series import AXES, Array, Series, join_series
 from tools.imu.stability import stability
 from tools.imu.thermal import Thermal, thermal
@@ -125,16 +126,17 @@ def _thermal_row(found: Thermal, unit: str) -> dict[str, Any]:
 
 
 def evaluate_fall(series: Series) -> dict[str, Any]:
-    """Zero-g offsets by free fall. ``InputError`` when nothing falls."""
-    fall = free_fall(series)
-    if fall is None:
+    """Compute zero-g offsets from a free fall from rest. ``InputError`` when nothing falls."""
+    fall = find_fall(series.accel_g, series.rate_hz)
+    if fall is None or fall[0] == 0 or fall[1] == len(series.accel_g):
         raise InputError(f"{series.name}: no free fall of 50 ms or more that begins and ends in the recording")
+    seconds = (fall[1] - fall[0]) / series.rate_hz
     return {
         "sensor": series.name,
-        "offset_g": _xyz(fall.offset_g),
-        "start_s": fall.start_s,
-        "fall_s": fall.seconds,
-        "speed_m_s": fall.speed_m_s,
+        "offset_g": _xyz(series.accel_g[inside_fall(fall)].mean(axis=0)),
+        "start_s": fall[0] / series.rate_hz,
+        "fall_s": seconds,
+        "speed_m_s": STANDARD_GRAVITY * seconds,
     }
 
 

@@ -1,5 +1,6 @@
-"""Computes offsets by the four methods of Erat 2018: manual, free fall and simple (5.2.1), and the gyroscope's mean
-(5.3.1).
+"""Computes offsets by the methods of Erat 2018: manual and simple (5.2.1), and the gyroscope's mean (5.3.1).
+
+Free fall is in ``tools.calibrate.quick``.
 
 An offset is what the sensor shows too much; its offset register takes the negative (erratum 115).
 """
@@ -9,20 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.types import STANDARD_GRAVITY
 from tools.calibrate.still import quiet_level, spread
 from tools.errors import InputError
 from tools.imu.series import AXES, Array, Series
 
 UPRIGHT = 0.97
 """A pole counts as reached when the axis came within this much of 1 g of the widest reading of all axes."""
-FALL_G = 0.5
-SHORTEST_FALL_S = 0.05
-BOUNCE_S = 0.005
-NEAR_G = 0.1
-EDGE_SHARE = 0.1
 STILL_FACTOR = 4.0
 
 
@@ -58,64 +52,6 @@ def manual(series: Series) -> ManualOffset:
     missing = [f"+{a}" for a, v in zip(AXES, top, strict=True) if v < UPRIGHT * reach - 0.1]
     missing += [f"-{a}" for a, v in zip(AXES, bottom, strict=True) if -v < UPRIGHT * reach - 0.1]
     return ManualOffset((top + bottom) / 2.0, (top - bottom) / 2.0, tuple(missing))
-
-
-@dataclass(frozen=True)
-class FreeFall:
-    """Holds ``offset_g`` (3,), the mean while falling, and ``start_s`` and ``seconds`` of the fall."""
-
-    offset_g: Array
-    start_s: float
-    seconds: float
-
-    @property
-    def speed_m_s(self) -> float:
-        """Return the speed at the end of the fall, from rest."""
-        return STANDARD_GRAVITY * self.seconds
-
-
-def free_fall(series: Series) -> FreeFall | None:
-    """The longest time that the reading stood still near zero; None when there is none of 50 ms.
-
-    Searched where |a| is below half of 1 g; falling is what stays within 0.1 g of the quietest 50 ms there (resistance
-    of a liquid, a rope or the air that grows afterwards ends it). A rebound of less than 5 ms (what held the sensor
-    lets go with a jerk) does not. The offset leaves out a tenth at either end.
-    """
-    accel = series.accel_g
-    low = _runs(np.linalg.norm(accel, axis=1) < FALL_G, 0)
-    shortest = max(3, round(SHORTEST_FALL_S * series.rate_hz))
-    best: tuple[int, int] | None = None
-    for start, stop in low:
-        if stop - start < shortest:
-            continue
-        quiet = start + int(np.argmin(spread(accel[start:stop], shortest)))
-        around = accel[max(start, quiet - shortest // 2) : quiet + shortest // 2 + 1]
-        off = np.linalg.norm(accel - np.median(around, axis=0), axis=1)
-        for first, last in _runs(off < NEAR_G, max(1, round(BOUNCE_S * series.rate_hz))):
-            if (
-                first <= quiet < last
-                and last - first >= shortest
-                and (best is None or last - first > best[1] - best[0])
-            ):
-                best = first, last
-    if best is None or best[0] == 0 or best[1] == len(accel):
-        return None
-    first, last = best
-    margin = round(EDGE_SHARE * (last - first))
-    mean = accel[first + margin : last - margin].mean(axis=0)
-    return FreeFall(mean, first / series.rate_hz, (last - first) / series.rate_hz)
-
-
-def _runs(here: NDArray[np.bool_], bridge: int) -> list[tuple[int, int]]:
-    """(start, stop) of the runs of True; gaps of fewer than ``bridge`` samples are closed."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(np.int8))).reshape(-1, 2)
-    runs: list[tuple[int, int]] = []
-    for start, stop in edges.tolist():
-        if runs and start - runs[-1][1] < bridge:
-            runs[-1] = (runs[-1][0], stop)
-        else:
-            runs.append((start, stop))
-    return runs
 
 
 def simple(series: Series) -> Array:

@@ -22,7 +22,15 @@ import numpy as np
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
 from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit, word
-from tools.mismatch.recording_columns import Array, column_names, column_units, first_line, read_blocks, read_scalars
+from tools.mismatch.recording_columns import (
+    Array,
+    column_names,
+    column_units,
+    first_line,
+    own_recording,
+    read_blocks,
+    read_scalars,
+)
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.stamps import StampReader, Stamps
@@ -111,6 +119,10 @@ def guess(path: Path, kind: str = "") -> Guess:
 
     Raises RecordingError.
     """
+    if own_recording(path) is not None:
+        raise RecordingError(
+            f"{path}: a recording of micron run; 'micron export {path} FOLDER' writes it with its twin and bench"
+        )
     names = column_names(path)
     if not names:
         raise RecordingError(
@@ -119,9 +131,11 @@ def guess(path: Path, kind: str = "") -> Guess:
     if len(names) > MOST_COLUMNS:
         raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
     file_units = column_units(path)
-    parts = {k: (k, file_units[k]) if file_units.get(k) else split_unit(k) for k in names}
+    parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else split_unit(k) for k in names}
     words = words_in(path)
     notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
+    unknown_units = {k: u for k, u in file_units.items() if u and not units.is_unit(u)}
+    notes += [f"column '{k}': its unit '{u}' in the file is not known" for k, u in unknown_units.items()]
     row = first_line(path)
     seen, stamps, clock, n, assumed = _scan(path, names, parts, row)
     if n < 2:
@@ -155,21 +169,11 @@ def guess(path: Path, kind: str = "") -> Guess:
         if found.roles[k] and seen[k].missing
     ]
     clock_unit = parts[clock][1] or "s" if clock else "s"
-    time_column, rate_hz = clock, None
     if stamps is not None:
-        rate_hz = stamps.rate_hz
-        if units.parse(clock_unit).factor != 1.0:
-            time_column = ""
-        usable = stamps.is_usable if time_column else stamps.is_even
-        if not usable:
-            broken.append(_broken_clock(clock, stamps))
-        elif not time_column:
-            notes.append(f"column '{clock}' is the time in {clock_unit}: its even steps are written as rate_hz")
-        elif stamps.faults:
-            notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
+        time_column, rate_hz = _time_of(clock, clock_unit, stamps, broken, notes)
     else:
         constants = {k: c.smallest for k, c in seen.items() if c.smallest == c.largest}
-        rate_hz = _rate_beside({**constants, **read_scalars(path)}, notes)
+        time_column, rate_hz = clock, _rate_beside({**constants, **read_scalars(path)}, notes)
         if rate_hz is None:
             unknown.append("the rate: no column is a time that runs forwards; set rate_hz, or repeat with --rate HZ")
     columns = [
@@ -185,6 +189,19 @@ def guess(path: Path, kind: str = "") -> Guess:
         for k in names
     ]
     return Guess(n, time_column, rate_hz, kind, columns, unknown, broken, assumed, notes, clock, clock_unit, row)
+
+
+def _time_of(clock: str, unit: str, stamps: Stamps, broken: list[str], notes: list[str]) -> tuple[str, float | None]:
+    """Return the time column, empty where even steps in another unit than s become a rate, and the rate in Hz."""
+    time_column = clock if units.parse(unit).factor == 1.0 else ""
+    usable = stamps.is_usable if time_column else stamps.is_even
+    if not usable:
+        broken.append(_broken_clock(clock, stamps))
+    elif not time_column:
+        notes.append(f"column '{clock}' is the time in {unit}: its even steps are written as rate_hz")
+    elif stamps.faults:
+        notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
+    return time_column, stamps.rate_hz
 
 
 def place(sample: int, row_of_first: int) -> str:

@@ -64,9 +64,7 @@ def split_unit(name: str) -> tuple[str, str]:
     plain = found["name"].strip().rstrip(",").strip()
     if unit in ("C", "F") and "temp" in plain.lower():
         unit = f"deg{unit}"
-    try:
-        units.parse(unit)
-    except units.UnitError:
+    if unit and not units.is_unit(unit):
         return name.strip(), ""
     if not found["inside"] and (unit.isdigit() or unit in _ORDINARY_WORDS):
         return name.strip(), ""

@@ -7,6 +7,7 @@ import json
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError as McapRecordingError
+from firmware_py.recording.reader import Recording
 from firmware_py.recording.scan import ChunkMessage, mcap_records
 from hal.npz import open_npz
 from tools.errors import RecordingError, missing_column
@@ -25,6 +27,8 @@ SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap", ".parquet", ".nc", ".
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000
 MAX_MESSAGE_BYTES = 1 << 24
+MOST_ACROSS = 16
+"""Largest number of columns of an array (n, k) in an .npz file; a wider one is no table."""
 _NOT_JSON = (ValueError, RecursionError, OverflowError)
 
 
@@ -93,7 +97,7 @@ def _format(path: Path) -> _Format:
     return {
         ".npz": _Format(_npz_names, _npz),
         ".mat": _Format(_mat_names, _mat),
-        ".mcap": _Format(_mcap_names, _mcap),
+        ".mcap": _Format(_mcap_names, _mcap, _mcap_units),
         ".parquet": _Format(parquet.names, parquet.read, parquet.units),
         ".nc": _Format(netcdf.names, netcdf.read, netcdf.units),
         ".mf4": _Format(mdf.names, mdf.read, mdf.units),
@@ -109,15 +113,49 @@ def _text_units(path: Path) -> dict[str, str]:
     return {name: unit for name, unit in zip(table.names, table.units, strict=True) if unit}
 
 
-def _npz_names(path: Path) -> list[str]:
+def _npz_columns(path: Path, names: list[str] | None = None) -> tuple[dict[str, Array], dict[str, str]]:
+    """Return columns of numbers by name (those of ``names``, or all), and the form of every array that is none.
+
+    An array (n, k) of at most ``MOST_ACROSS`` columns is the columns ``name_0``, ``name_1`` and so on.
+    """
+    columns: dict[str, Array] = {}
+    others: dict[str, str] = {}
     try:
         with open_npz(path) as data:
-            sizes = {k: a.size for k in data.files if (a := data[k]).ndim == 1 and a.dtype.kind in "fiub"}
-            return [k for k, size in sizes.items() if size == max(sizes.values())]
+            for name in data.files:
+                if names is not None and name not in names and not any(n.startswith(f"{name}_") for n in names):
+                    others[name] = "not read"
+                    continue
+                a = data[name]
+                if a.dtype.kind in "fiub" and a.ndim == 1:
+                    columns[name] = np.asarray(a, np.float64)
+                elif a.dtype.kind in "fiub" and a.ndim == 2 and a.shape[1] <= MOST_ACROSS:
+                    columns |= {f"{name}_{i}": a[:, i].astype(np.float64) for i in range(a.shape[1])}
+                else:
+                    others[name] = f"{a.dtype} of shape {a.shape}"
     except RecordingError:
         raise
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}; save plain numeric arrays (no pickled objects)") from None
+    return columns, others
+
+
+def _npz_names(path: Path) -> list[str]:
+    columns, _ = _npz_columns(path)
+    longest = max((v.size for v in columns.values()), default=0)
+    return [name for name, values in columns.items() if values.size == longest]
+
+
+def _npz(path: Path, names: list[str]) -> dict[str, Array]:
+    columns, others = _npz_columns(path, names)
+    for name in names:
+        if name not in columns:
+            if others.get(name, "not read") != "not read":
+                raise RecordingError(f"{path}: column '{name}' is {others[name]}; needed: numbers, one dimension")
+            raise missing_column(path, name, [*columns, *others])
+    return {name: columns[name] for name in names}
 
 
 def _mat_names(path: Path) -> list[str]:
@@ -152,7 +190,30 @@ def read_scalars(path: Path) -> dict[str, float]:
         raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
 
 
+def own_recording(path: Path) -> Recording | None:
+    """Return the recording at ``path`` if ``micron run`` made it, else None."""
+    if path.suffix.lower() != ".mcap":
+        return None
+    try:
+        return _opened(path, path.stat().st_mtime_ns)
+    except (McapRecordingError, OSError):
+        return None
+
+
+@lru_cache(maxsize=1)
+def _opened(path: Path, _changed_ns: int) -> Recording:
+    return Recording(path)
+
+
+def _mcap_units(path: Path) -> dict[str, str]:
+    own = own_recording(path)
+    return {} if own is None else {column.name: column.unit for column in own.columns}
+
+
 def _mcap_names(path: Path) -> list[str]:
+    own = own_recording(path)
+    if own is not None:
+        return list(own.names)
     names: dict[str, None] = {}
     for topic, encoding, message in itertools.islice(_messages(path), 1000):
         if encoding == "json":
@@ -191,34 +252,17 @@ def _messages(path: Path) -> Iterator[tuple[str, str, ChunkMessage]]:
         raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
 
 
-def _npz(path: Path, names: list[str]) -> dict[str, Array]:
-    try:
-        with open_npz(path) as data:
-            have = list(data.files)
-            out: dict[str, Array] = {}
-            for name in names:
-                if name not in have:
-                    raise missing_column(path, name, have)
-                a = data[name]
-                if a.ndim != 1 or a.dtype.kind not in "fiub":
-                    raise RecordingError(
-                        f"{path}: column '{name}' is {a.dtype} of shape {a.shape}; needed: numbers, one dimension"
-                    )
-                out[name] = np.asarray(a, np.float64)
-    except OSError as error:
-        raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
-    except ValueError as error:
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{path}: {error}; save plain numeric arrays (no pickled objects)") from None
-    return out
-
-
 def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
-    """Read JSON messages in order of their log time.
+    """Read columns of a recording of ours, or JSON messages of another program in order of their log time.
 
-    A column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``.
+    A column of JSON messages is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``.
     """
+    own = own_recording(path)
+    if own is not None:
+        for name in names:
+            if name not in own.names:
+                raise missing_column(path, name, own.names)
+        return dict(zip(names, np.ascontiguousarray(own.array(names).T), strict=True))
     wanted = {n: n.rsplit(".", 1)[0] for n in names}
     found: dict[str, array[float]] = {n: array("d") for n in names}
     times: dict[str, array[int]] = {n: array("Q") for n in names}

@@ -41,6 +41,10 @@ class _Channel:
     step: float | None
     tolerance: float | None = None
 
+    def scaled(self, difference: float | None) -> float | None:
+        """Return a difference that the descriptor gives in the channel's unit in the unit of the twin."""
+        return None if difference is None else units.convert_difference(difference, self.unit, self.to)
+
 
 def load(path: Path | str) -> Recording:
     """Load the recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), check and convert it.
@@ -77,20 +81,74 @@ def from_table(
     data_path = path if columns is not None else path_inside(path, str(data_name))
     in_file = column_units(data_path) if columns is None and data_path.is_file() else {}
     channels = _channels(where, text["channels"], words, twin.kind, notes, in_file)
-    rate = _number(where, "rate_hz", text.get("rate_hz"))
-    time_column = text.get("time_column")
+    rate, time_column = _clock(where, text)
+    names = [c.column for c in channels]
+    if time_column is not None and time_column not in names:
+        names.append(time_column)
+    columns = read_columns(data_path, names) if columns is None else {name: columns[name] for name in names}
+    _check_samples(data_path, columns)
+    on_new_grid = False
+    if time_column is not None:
+        stamps = columns[time_column]
+        dt, grid = _step(data_path, time_column, stamps, rate, notes)
+        if grid is not None:
+            columns = {name: on_grid(grid, dt, stamps, x) for name, x in columns.items()}
+            on_new_grid = True
+    else:
+        assert rate is not None
+        dt = 1.0 / rate
+    n = columns[names[0]].size
+    segments = _segments(path, text.get("segments"), n, twin.kind, on_new_grid)
+    parts: dict[Role, dict[str, Array]] = {"input": {}, "output": {}, "context": {}}
+    for c in channels:
+        parts[c.role][c.signal] = _converted(data_path, c, columns[c.column], notes)
+    input_noise = {c.signal: noise for c in channels if c.role == "input" and (noise := c.scaled(c.noise)) is not None}
+    for signal, noise in input_noise.items():
+        parts["input"][signal] = conditional_mean(parts["input"][signal], noise, segments)
+    _same_data(data_path, channels, columns, notes)
+    recording = Recording(
+        path=path,
+        title=str(text.get("title", path.stem)),
+        t=np.asarray(np.arange(n) * dt, np.float64),
+        dt=dt,
+        inputs=parts["input"],
+        outputs=parts["output"],
+        context=parts["context"],
+        noise={c.signal: c.scaled(c.noise) for c in channels if c.role == "output"},
+        unit={c.signal: c.to for c in channels},
+        declared_unit={c.signal: c.unit for c in channels},
+        column={c.signal: c.column for c in channels},
+        twin=twin,
+        split=_split(path, text.get("split"), n),
+        declared_step={c.signal: step for c in channels if (step := c.scaled(c.step)) is not None},
+        tolerance={c.signal: most for c in channels if (most := c.scaled(c.tolerance)) is not None},
+        warnings=tuple(notes),
+        segments=segments,
+        input_noise=input_noise,
+        conditions=_conditions(where, text.get("conditions")),
+    )
+    if twin.kind in ("state_space", "ode"):
+        from tools.mismatch.recording_units import in_twin_units
+
+        return in_twin_units(recording)
+    return recording
+
+
+def _clock(where: str, text: Mapping[str, Any]) -> tuple[float | None, str | None]:
+    """Return the rate in Hz and the name of the time column; at least one of them is given."""
+    rate, time_column = _number(where, "rate_hz", text.get("rate_hz")), text.get("time_column")
     if rate is None and time_column is None:
         raise RecordingError(f"{where}: neither 'rate_hz' nor 'time_column'; give one of them")
     if rate is not None and rate <= 0:
         raise RecordingError(f"{where}: rate_hz must be positive, got {rate}")
-    names = [c.column for c in channels]
-    if time_column is not None:
-        if not isinstance(time_column, str):
-            raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
-        if time_column not in names:
-            names.append(time_column)
-    columns = read_columns(data_path, names) if columns is None else {name: columns[name] for name in names}
-    n = columns[names[0]].size
+    if time_column is not None and not isinstance(time_column, str):
+        raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
+    return rate, time_column
+
+
+def _check_samples(data_path: Path, columns: Mapping[str, Array]) -> None:
+    """Refuse data that are too short, or that hold a value which is no finite number."""
+    n = next(iter(columns.values())).size
     if n < MIN_SAMPLES:
         raise RecordingError(
             f"{data_path}: {n} samples; at least {MIN_SAMPLES} are needed to tell physics from noise;"
@@ -102,72 +160,24 @@ def from_table(
             i = int(np.argmax(bad))
             line = f" (line {i + 2})" if data_path.suffix.lower() == ".csv" else ""
             raise RecordingError(f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; {CUT}")
-    grid: Array | None = None
-    if time_column is not None:
-        stamps = columns[time_column]
-        dt, grid = _step(data_path, time_column, stamps, rate, notes)
-        if grid is not None:
-            columns = {name: on_grid(grid, dt, stamps, x) for name, x in columns.items()}
-            n = grid.size
-    else:
-        assert rate is not None
-        dt = 1.0 / rate
-    segments = _segments(path, text.get("segments"), n, twin.kind, grid is not None)
-    parts: dict[str, dict[str, Array]] = {"input": {}, "output": {}, "context": {}}
-    input_noise: dict[str, float] = {}
-    for c in channels:
-        values = units.convert(columns[c.column], c.unit, c.to)
-        size = float(np.max(np.abs(values)))
-        if size > MOST_SIZE or 0 < size < 1 / MOST_SIZE:
-            raise RecordingError(
-                f"{data_path}: column '{c.column}' reaches {size:g} {c.to}; the unit or the data are wrong"
-            )
-        if np.ptp(values) == 0.0:
-            if c.role == "output":
-                raise RecordingError(
-                    f"{data_path}: column '{c.column}' (output '{c.signal}') never changes from {values[0]}"
-                    " sample 0 to the end; a dead sensor or the wrong column"
-                )
-            notes.append(f"column '{c.column}' ({c.role} '{c.signal}') never changes")
-        if c.role == "input" and c.noise is not None:
-            input_noise[c.signal] = units.convert_difference(c.noise, c.unit, c.to)
-            values = conditional_mean(values, input_noise[c.signal], segments)
-        parts[c.role][c.signal] = values
-    _same_data(data_path, channels, columns, notes)
-    recording = Recording(
-        path=path,
-        title=str(text.get("title", path.stem)),
-        t=np.asarray(np.arange(n) * dt, np.float64),
-        dt=dt,
-        inputs=parts["input"],
-        outputs=parts["output"],
-        context=parts["context"],
-        noise={
-            c.signal: None if c.noise is None else units.convert_difference(c.noise, c.unit, c.to)
-            for c in channels
-            if c.role == "output"
-        },
-        unit={c.signal: c.to for c in channels},
-        declared_unit={c.signal: c.unit for c in channels},
-        column={c.signal: c.column for c in channels},
-        twin=twin,
-        split=_split(path, text.get("split"), n),
-        declared_step={
-            c.signal: units.convert_difference(c.step, c.unit, c.to) for c in channels if c.step is not None
-        },
-        tolerance={
-            c.signal: units.convert_difference(c.tolerance, c.unit, c.to) for c in channels if c.tolerance is not None
-        },
-        warnings=tuple(notes),
-        segments=segments,
-        input_noise=input_noise,
-        conditions=_conditions(where, text.get("conditions")),
-    )
-    if twin.kind in ("state_space", "ode"):
-        from tools.mismatch.recording_units import in_twin_units
 
-        return in_twin_units(recording)
-    return recording
+
+def _converted(data_path: Path, c: _Channel, column: Array, notes: list[str]) -> Array:
+    """Return a channel in the unit of the twin. Raises RecordingError for sizes and outputs that cannot be right."""
+    values = units.convert(column, c.unit, c.to)
+    size = float(np.max(np.abs(values)))
+    if size > MOST_SIZE or 0 < size < 1 / MOST_SIZE:
+        raise RecordingError(
+            f"{data_path}: column '{c.column}' reaches {size:g} {c.to}; the unit or the data are wrong"
+        )
+    if np.ptp(values) == 0.0:
+        if c.role == "output":
+            raise RecordingError(
+                f"{data_path}: column '{c.column}' (output '{c.signal}') never changes from {values[0]}"
+                " sample 0 to the end; a dead sensor or the wrong column"
+            )
+        notes.append(f"column '{c.column}' ({c.role} '{c.signal}') never changes")
+    return values
 
 
 def descriptor(path: Path) -> dict[str, Any]:

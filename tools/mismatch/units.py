@@ -148,6 +148,17 @@ def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
     raise UnitError(f"unknown unit '{text}'" + (f" (symbol '{symbol}')" if symbol != text else ""))
 
 
+def is_unit(text: str | None) -> bool:
+    """Return True for a unit that ``parse`` knows; False for none and for an empty text."""
+    if not text:
+        return False
+    try:
+        parse(text)
+    except UnitError:
+        return False
+    return True
+
+
 def same_dimension(a: str, b: str) -> bool:
     """Return True if values in ``a`` can be converted to ``b``."""
     return parse(a).dimension == parse(b).dimension

@@ -21,8 +21,8 @@ WINDOW_S = 1.0
 """Time constant of the rms that is shown."""
 
 PACES: Mapping[Pace, str] = {
-    "paced": "emulated time, one second per second; the same result on every machine",
-    "virtual": "emulated time, as fast as this machine can; the same result on every machine",
+    "paced": "emulated time, one second per second; same result on every machine",
+    "virtual": "emulated time, as fast as possible; same result on every machine",
     "realtime": "the wall clock; a 1 kHz loop in processes of its own",
 }
 

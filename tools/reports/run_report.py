@@ -186,7 +186,7 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
     if any(result.get("warnings", {}).values()):
         lines.append(
             "hand, noted without consequence: "
-            + ", ".join(f"{what} {n} times" for what, n in result["warnings"].items() if n)
+            + ", ".join(f"{what} {'once' if n == 1 else f'{n} times'}" for what, n in result["warnings"].items() if n)
         )
     reached = "reached" if safe["reached"] else "NOT CONFIRMED"
     lines.append(f"safe state {reached}: {safe['reason']}")

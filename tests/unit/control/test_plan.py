@@ -8,7 +8,8 @@ import pytest
 
 from drivers.options import AmplifierMonitorOptions, DacAmplifierOptions
 from firmware_py.control.plan import load_plan
-from hal.bench import load_bench
+from firmware_py.control.wiring import open_devices
+from hal.bench import load_bench, open_bench
 from hal.errors import BenchError
 from sim_devices.config import AmplifierConfig, emulation_config
 from sim_devices.world import MONITOR_RATIO
@@ -68,3 +69,12 @@ def test_what_the_emulation_assumes_of_a_bare_entry_is_the_drivers_default() -> 
     assert (emulated.gain, emulated.neutral_V) == (output.gain, output.neutral_V)
     assert (emulated.low_V, emulated.high_V) == (output.lo_V, output.hi_V)
     assert AmplifierMonitorOptions().ratio == MONITOR_RATIO
+
+
+def test_a_second_device_that_the_instrument_would_ignore_is_refused(tmp_path: Path) -> None:
+    bench = load_bench(bench_with(tmp_path, more='[device.other]\ndriver = "can_telemetry"\nbus = "can0"\n'))
+    with (
+        open_bench(bench, pace="virtual", runtime_dir=tmp_path) as opened,
+        pytest.raises(BenchError, match="reads one can_telemetry, this bench has telemetry, other; remove all but one"),
+    ):
+        open_devices(opened)

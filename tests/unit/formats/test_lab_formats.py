@@ -20,6 +20,7 @@ from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.formats.export import export
 from tools.formats.netcdf import dataset
+from tools.mismatch.guess import guess
 from tools.mismatch.recording_columns import column_names, column_units, read_columns
 from tools.mismatch.recording_load import load
 
@@ -270,3 +271,49 @@ def test_parquet_times_are_seconds_and_empty_cells_nan(tmp_path: Path):
     assert np.array_equal(found["x"], [1.0, np.nan, 3.0], equal_nan=True)
     with pytest.raises(RecordingError, match="column 'who' is object"):
         read_columns(path, ["who"])
+
+
+def test_a_recording_of_ours_is_a_data_file_like_any_other(run: Recording) -> None:
+    assert column_names(run.path) == list(run.names)
+    assert column_units(run.path) == dict(COLUMNS)
+    read = read_columns(run.path, [run.names[2], run.names[0]])
+    assert list(read) == [run.names[2], run.names[0]]
+    for name, values in read.items():
+        assert np.array_equal(values, run.column(name), equal_nan=True)
+    with pytest.raises(RecordingError, match="no column 'absent'"):
+        read_columns(run.path, ["absent"])
+
+
+def test_an_array_of_two_dimensions_in_an_npz_is_numbered_columns(tmp_path: Path) -> None:
+    values = np.arange(12.0).reshape(4, 3)
+    np.savez(tmp_path / "d.npz", a=values, t=np.arange(4), wide=np.zeros((4, 17)), one=np.float64(3.0))
+    assert column_names(tmp_path / "d.npz") == ["a_0", "a_1", "a_2", "t"]
+    assert read_columns(tmp_path / "d.npz", ["a_2"])["a_2"] == pytest.approx(values[:, 2])
+    with pytest.raises(RecordingError, match=r"'wide' is float64 of shape \(4, 17\)"):
+        read_columns(tmp_path / "d.npz", ["wide"])
+
+
+def test_a_recording_of_ours_is_not_guessed_because_export_knows_it(run: Recording) -> None:
+    with pytest.raises(RecordingError, match="a recording of micron run"):
+        guess(run.path)
+
+
+def test_a_unit_that_nobody_knows_is_said_and_left_out(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray", reason="extra: pip install 'micron-bench[lab]'")
+    t = np.arange(3000) * 1e-3
+    drive = np.sin(9.0 * t) * 40.0 + 50.0
+    columns = {"t": (t, "s"), "drive": (drive, "V"), "move": (0.1 * drive**1.01, "um"), "flags": (np.floor(t), "bits")}
+    data = xarray.Dataset({name: ("row", values, {"units": unit}) for name, (values, unit) in columns.items()})
+    data.to_netcdf(tmp_path / "d.nc", engine="h5netcdf")
+    found = guess(tmp_path / "d.nc")
+    assert "column 'flags': its unit 'bits' in the file is not known" in found.notes
+    assert {c.name: c.unit for c in found.columns}["flags"] == ""
+
+
+def test_the_descriptor_of_another_file_beside_it_says_nothing_of_a_log(run: Recording) -> None:
+    other = 'data = "other.csv"\ntime_column = "time_s"\nrate_hz = 5.0\n'
+    (run.path.parent / "recording.toml").write_text(other)
+    assert load_log(run.path).time_column == "t"
+    (run.path.parent / "recording.toml").write_text(other.replace("other.csv", run.path.name))
+    with pytest.raises(InputError, match="time_column 'time_s' is no column"):
+        load_log(run.path)

@@ -16,7 +16,7 @@ from tools.cli.main import app
 from tools.errors import InputError
 from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_still, evaluate_turned
 from tools.imu.live import auto_calibrate, record
-from tools.imu.offsets import free_fall, manual, moved, simple
+from tools.imu.offsets import manual, moved, simple
 from tools.imu.series import Scales, Series, join_series, load_series
 from tools.imu.stability import stability
 from tools.imu.thermal import thermal
@@ -66,12 +66,12 @@ def test_free_fall_from_a_made_up_drop() -> None:
     accel[800 : 800 + round(fall_s * rate_hz)] = 0.0
     accel[1100:1110, 2] = 8.0
     accel += np.array([0.01, -0.02, 0.03]) + 0.002 * rng.standard_normal(accel.shape)
-    found = free_fall(Series("", rate_hz, accel, None))
-    assert found is not None
-    assert found.seconds == pytest.approx(fall_s, abs=2e-3)
-    assert found.start_s == pytest.approx(0.8, abs=2e-3)
-    assert found.offset_g == pytest.approx([0.01, -0.02, 0.03], abs=5e-4)
-    assert free_fall(still()) is None
+    found = evaluate_fall(Series("", rate_hz, accel, None))
+    assert found["fall_s"] == pytest.approx(fall_s, abs=2e-3)
+    assert found["start_s"] == pytest.approx(0.8, abs=2e-3)
+    assert list(found["offset_g"].values()) == pytest.approx([0.01, -0.02, 0.03], abs=5e-4)
+    with pytest.raises(InputError, match="no free fall"):
+        evaluate_fall(still())
 
 
 def test_a_moved_sensor_is_noticed() -> None:

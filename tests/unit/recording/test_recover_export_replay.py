@@ -254,24 +254,11 @@ class TestReplay:
             replay(record(tmp_path / "r.mcap", 100), Filter().run, ["a", "z"], ["x"])
 
 
-def test_roles_can_be_given_and_must_cover_input_and_output(tmp_path: Path) -> None:
+def test_a_folder_needs_inputs_and_outputs(tmp_path: Path) -> None:
     recording = record(tmp_path / "r.mcap", 100)
     with pytest.raises(RecordingError, match="no column has the role 'input'"):
         export_folder(recording, tmp_path / "folder")
     assert not (tmp_path / "folder").exists()
-    roles = {"a": "input", "x": "output"}
-    export_folder(
-        recording, tmp_path / "folder", data="csv", kind="state_space", parameters={"A": [[1.0]]}, roles=roles
-    )
-    text = tomllib.loads((tmp_path / "folder" / "recording.toml").read_text())
-    assert text["rate_hz"] == 1000.0
-    assert text["twin"] == {"kind": "state_space", "parameters": {"A": [[1.0]]}}
-    assert {c["column"]: c["role"] for c in text["channels"]} == {
-        "a": "input",
-        "b": "context",
-        "x": "output",
-        "y": "context",
-    }
 
 
 def test_writing_needs_no_rows_to_be_finite(tmp_path: Path) -> None:

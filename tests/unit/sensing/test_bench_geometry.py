@@ -10,7 +10,7 @@ import pytest
 from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
-from sim_devices.plant.sensors import AXES, DIRECTION, LOCATION
+from sim_devices.plant.sensors import DIRECTION, LOCATION
 
 BENCHES = Path(__file__).parents[3] / "benches"
 
@@ -26,5 +26,5 @@ def test_positions_tip_and_channels_agree(name: str) -> None:
     places = np.array(drawn.positions_mm)[list(LOCATION)] * 1e-3
     np.testing.assert_allclose(sensing.axis_positions(), places, atol=1e-12)
     # the calibrated directions are within the assembly's tolerance of the drawn ones
-    assert len(AXES) == len(sensing.axes)
-    assert all(abs(sensing.axes[i][DIRECTION[i]]) > np.cos(np.radians(3.0)) for i in range(len(AXES)))
+    assert len(DIRECTION) == len(sensing.axes)
+    assert all(abs(sensing.axes[i][DIRECTION[i]]) > np.cos(np.radians(3.0)) for i in range(len(DIRECTION)))

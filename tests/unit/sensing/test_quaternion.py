@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from firmware_py.sensing.quaternion import from_matrix, multiply, rotate_by, to_matrix
+from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.triad import triad
 
 RANDOM = Rotation.random(50, rng=np.random.default_rng(1))
@@ -26,15 +26,6 @@ def test_matrix_and_quaternion_are_one_rotation(rotation: Rotation) -> None:
     assert q[0] >= 0.0
     to_matrix(q, c)
     np.testing.assert_allclose(c, rotation.as_matrix(), atol=1e-12)
-
-
-def test_product_composes_body_rotations() -> None:
-    out = np.empty(4)
-    for a, b in zip(RANDOM[:20], RANDOM[20:40], strict=True):
-        multiply(scalar_first(a), scalar_first(b), out)
-        c = np.empty((3, 3))
-        to_matrix(out, c)
-        np.testing.assert_allclose(c, (a * b).as_matrix(), atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-6, 1e-3, 0.1, 2.0])

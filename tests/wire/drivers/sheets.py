@@ -1,13 +1,18 @@
-"""The data sheets in ``drivers/sheets``, read."""
+"""Reads the data sheets in ``data_sheets``: what a part measures or moves, in which unit and range, and how fast.
+
+They are written from the makers' documents without a look at the drivers; ``test_sheets`` compares both.
+"""
 
 from __future__ import annotations
 
 import tomllib
-from importlib import resources
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from hal.types import ChannelInfo
+
+FOLDER = Path(__file__).parent / "data_sheets"
 
 
 class _Table(BaseModel):
@@ -51,11 +56,10 @@ class Sheet(_Table):
 
 def names() -> list[str]:
     """Drivers that have a sheet."""
-    files = resources.files("drivers.sheets").iterdir()
-    return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
+    return sorted(file.stem for file in FOLDER.glob("*.toml"))
 
 
 def load_sheet(name: str) -> Sheet:
     """The sheet of driver ``name``."""
-    text = resources.files("drivers.sheets").joinpath(f"{name}.toml").read_text(encoding="utf-8")
+    text = (FOLDER / f"{name}.toml").read_text(encoding="utf-8")
     return Sheet.model_validate(tomllib.loads(text))

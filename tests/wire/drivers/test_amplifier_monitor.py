@@ -135,7 +135,7 @@ def test_a_command_under_way_may_have_arrived_already():
     stand.guard.admit(np.array([60.0, 50.0, 50.0]))
     stand.clock.burn_ns(3 * MS)
     stand.guard.sent()
-    last_V = stand.guard.sent_commands[-2].volts[0]
+    last_V = list(stand.guard.sent_commands())[1].volts[0]
     window = Window(begun_ns, begun_ns, 2 * MS, 2 * MS)
     assert stand.monitor.expected_V(0, window) == pytest.approx((min(last_V, 60.0), max(last_V, 60.0)))
 

@@ -230,4 +230,4 @@ def test_a_command_that_is_read_back_took_force_before_the_reading():
         read_with(update(0x8000, 0x8000, 0x8000), NEUTRAL), update(0x8000, 0x8000, 0x8000), read_back=True
     )
     amplifier.write(np.full(3, 50.0))
-    assert clock.now_ns() - amplifier.guard.sent_commands[-1].sent_ns == 200_000
+    assert clock.now_ns() - next(amplifier.guard.sent_commands()).sent_ns == 200_000

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import UNCENTRED
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, travelled
-from tools.mismatch.twins.feedback import Body, Rows, pack, run_feedback
+from tools.mismatch.twins.feedback import Body, Rows, pack
+from tools.mismatch.twins.forced import ForcedRun
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import (
     Discrete,
@@ -322,20 +322,47 @@ class DynamicTwin(Head):
     def _with_forces(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
     ) -> dict[str, Signal]:
-        source = self.inputs[0]
-        plant = self.plant_of(theta)
+        """Simulate one input's response in free run, without columns, and with forces inside the plant if any are."""
+        plant, drive = self.plant_of(theta), inputs[self.inputs[0]]
+        u, rows, extra = self._driven(drive, theta, np.zeros(plant.a.shape[0]))
         packed = pack(forces)
+        body = self._body(run, plant, rows, packed, bool(forces))
+        forced = ForcedRun(run, body, packed if forces else None, u, rows, extra, plant.blocks)
+        token: tuple[object, ...] = ("forced", theta[: len(self.parameters)].tobytes(), run.starts, run.window)
+        token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
+        token = (*token, *((f.effect.form, _key(f)) for f in forces))
+        return {o: Signal(y, {}, (*token, o)) for o, y in self._from_start(forced).items()}
+
+    def _from_start(self, forced: ForcedRun) -> dict[str, Array]:
+        """Return every output (n,), from the start state that is given, or that the measured samples set."""
+        run = forced.run
+        given = self.start_given or (run.window == 0 and not run.period)
+        if given and self.fixed_free is not None and run.starts == (0,):
+            # with forces, the start state is no linear function of the measurement: the engineer's own is used,
+            # unless the twin without forces starts from a fitted one as well
+            if forced.forces is not None and run.setting is not None and not self.at_rest:
+                return forced.outputs(forced.begin_by_setting())
+            free = self.fixed_free(run.t.size)
+            return {o: y + free[o] for o, y in forced.outputs(np.zeros((1, forced.order))).items()}
+        x0 = np.zeros((forced.starts.size, forced.order))
+        if forced.forces is not None and self.counted:
+            # the rows of the outputs do not show where it stands; how it came there was recorded
+            x0[:, 0] = travelled(run.measured[self.feedback_on], run.dt, self.counted)[forced.starts]
+        if run.period and (begin := forced.begin_by_period(x0)) is not None:
+            return forced.outputs(begin)
+        return forced.outputs(forced.begin_by_windows(x0))
+
+    def _driven(self, drive: Signal, theta: Array, no_row: Array) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Return the plant's input (n,), the row (s,) of each output, and what is added to each output (n,)."""
+        source = self.inputs[0]
         g = self.input_gain(source, theta)
-        drive = inputs[source]
-        u = g * drive.value
-        scale = 1.0 if self._gain_index(source) >= 0 else g
+        has_gain = self._gain_index(source) >= 0
+        direct = g * drive.value
         for j, c in drive.columns.items():
-            u = u + scale * theta[j] * c
-        rows: dict[str, Array] = {o: np.zeros(plant.a.shape[0]) for o in self.outputs}
-        extra: dict[str, Array] = {o: np.zeros(run.t.size) for o in self.outputs}
-        normal = self._gain_index(source) >= 0
-        direct = u
-        u = between_samples(u, self.hold)
+            direct = direct + (1.0 if has_gain else g) * theta[j] * c
+        rows = {o: no_row.copy() for o in self.outputs}
+        extra = {o: np.zeros(direct.size) for o in self.outputs}
+        u = between_samples(direct, self.hold)
         for j in {link.j for link in self.links if link.source == CONSTANT and link.row != -2}:
             u = u + theta[j]
         for link in self.links:
@@ -346,113 +373,30 @@ class DynamicTwin(Head):
             elif link.row == -1:
                 extra[link.output] = extra[link.output] + theta[link.j] * direct
             else:
-                rows[link.output][link.row] = 1.0 if normal else theta[link.j]
-        u = _once(u)
-        token: tuple[object, ...] = ("forced", theta[: len(self.parameters)].tobytes(), run.starts, run.window)
-        token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
-        token = (*token, *((f.effect.form, _key(f)) for f in forces))
-        cp = rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
-        if self.counted:
-            cp = np.eye(plant.a.shape[0])[0]
+                rows[link.output][link.row] = 1.0 if has_gain else theta[link.j]
+        return _once(u), rows, extra
+
+    def _body(self, run: Run, plant: Plant, rows: Mapping[str, Array], packed: Rows, has_forces: bool) -> Body:
+        """Return the discretised plant with the rows of the position and velocity on which forces depend.
+
+        Bristles of ``packed`` that are too stiff for the finest step become rigid, in place.
+        """
+        cp = np.eye(plant.a.shape[0])[0] if self.counted else rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
         sub = 1
-        if forces and self.hold != "discrete":
+        if has_forces and self.hold != "discrete":
             push = float(cp @ plant.a @ plant.b) or 1.0
-            # bristles too stiff for the finest step count as rigid
             packed.friction[5] = min(packed.friction[5], (0.7 * MOST_SUBSTEPS / run.dt) ** 2 / abs(push))
             sub = self._substeps(run, packed, push)
         d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
-        if self.hold == "discrete":
+        if self.counted or ("velocity" in self.outputs and self.feedback_on == "position"):
+            cv = rows["velocity"]
+        elif self.hold == "discrete":
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
         else:
             cv = cp @ plant.a if abs(cp @ plant.b) < 1e-12 * (np.abs(cp) @ np.abs(plant.b) + 1e-300) else cp
-        if self.counted or ("velocity" in self.outputs and self.feedback_on == "position"):
-            cv = rows["velocity"]
-        starts = np.array(run.starts, np.int64)
-        ends = np.array((*run.starts[1:], run.t.size), np.int64)
         held = self.hold in ("zero", "discrete")
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
-        body = Body(d.ad, d.g0, d.g1, cp, cv, held, sub, run.dt / sub, dry)
-
-        def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
-            if not forces:
-                return run_states(d.ad, d.g0, d.g1, drive, x0, first)
-            return run_feedback(body, packed, drive, x0, first, stop)
-
-        if (
-            self.fixed_free is not None
-            and run.starts == (0,)
-            and (self.start_given or (run.window == 0 and not run.period))
-        ):
-            # with forces, the start state is no linear function of the measurement: the engineer's own is used
-            if forces and run.setting is not None and not self.at_rest:
-                # unless the twin without forces starts from a fitted one as well
-                ss = start_state(np.linalg.matrix_power(d.ad, sub), rows, run, blocks=plant.blocks)
-                x0 = np.zeros((1, plant.a.shape[0]))
-                for _ in range(2):
-                    x = go(x0, u, starts, ends)
-                    x0 = x0 + ss.states({o: run.measured[o] - extra[o] - x @ rows[o] for o in self.outputs})
-                x = go(x0, u, starts, ends)
-                return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
-            free = self.fixed_free(run.t.size)
-            x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
-            return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
-        full = np.linalg.matrix_power(d.ad, sub)
-        ss = start_state(full, rows, replace(run, setting=None), whole=False)
-        x0 = np.zeros((starts.size, plant.a.shape[0]))
-        if forces and self.counted:
-            # the rows of the outputs do not show where it stands; how it came there was recorded
-            x0[:, 0] = travelled(run.measured[self.feedback_on], run.dt, self.counted)[starts]
-        if run.period:
-            begin = shot_to_repeat(go, np.linalg.matrix_power(full, run.period), x0, u, starts, run.period)
-            if begin is not None:
-                x = go(begin, u, starts, ends)
-                return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
-        # the windows that set the state are simulated alone, one after the other
-        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
-        seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
-        after = np.cumsum(stop - starts)
-        before = after - (stop - starts)
-        part = np.ascontiguousarray(u[seen])
-        need = {o: np.zeros(int(stop.max())) for o in self.outputs}
-        for _ in range(3 if forces else 1):
-            x = go(x0, part, before, after)
-            for o in self.outputs:
-                need[o][seen] = run.measured[o][seen] - extra[o][seen] - x @ rows[o]
-            x0 = x0 + ss.states(need)
-        x = go(x0, u, starts, ends)
-        return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
-
-
-Go = Callable[[Array, Array, NDArray[np.int64], NDArray[np.int64]], Array]
-MOST_SHOTS = 12
-REPEATS = 1e-9
-"""Change of a state over a period, relative to the largest state, below which it repeats."""
-NEARLY = 1e-3
-"""Change of a state over a period, relative to the largest state, that is accepted when shooting ends early."""
-
-
-def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: NDArray[np.int64], period: int) -> Array | None:
-    """Find start states (starts, s) to which a run returns after ``period`` samples, by shooting from ``x0``.
-
-    ``go(x0, u, starts, stops)`` returns states (n, s); ``full`` (s, s) is the linear plant over a period, which
-    approximates the Jacobian. Returns None without convergence: for an integrating plant, or a memory that does not
-    repeat.
-    """
-    stop = np.asarray((np.arange(starts.size) + 1) * (period + 1), np.int64)
-    part = np.concatenate([u[a : a + period + 1] for a in starts])
-    system = np.eye(full.shape[0]) - full
-    if np.linalg.cond(system) > 1e10:
-        return None
-    away = np.inf
-    for _ in range(MOST_SHOTS):
-        x = go(x0, part, stop - (period + 1), stop)
-        size = max(float(np.max(np.abs(x))), 1e-300)
-        change = x[stop - 1] - x0
-        away = float(np.max(np.abs(change))) / size
-        if not np.isfinite(away) or away <= REPEATS:
-            break
-        x0 = x0 + np.linalg.solve(system, change.T).T
-    return x0 if away <= NEARLY else None
+        return Body(d.ad, d.g0, d.g1, cp, cv, held, sub, run.dt / sub, dry)
 
 
 def discretise_blocks(plant: Plant, dt: float, hold: Hold) -> list[Discrete]:

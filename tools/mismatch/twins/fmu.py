@@ -97,10 +97,6 @@ def check_archive(path: Path) -> None:
         raise RecordingError(f"{path}: {len(members)} files of {size} bytes when unpacked; that is no FMU")
 
 
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
-
-
 def _check_fmpy(where: Path) -> None:
     if sys.modules.get("fmpy", ...) is None or importlib.util.find_spec("fmpy") is None:
         raise RecordingError(f"{where}: [twin] kind 'fmu' needs FMPy: install this package with its extra 'fmu'")

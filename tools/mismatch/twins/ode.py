@@ -17,7 +17,6 @@ from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.affine import Steps, exact_steps
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
-from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.equations import (
     LEAST_SHOWN,
     NOTHING,
@@ -30,6 +29,7 @@ from tools.mismatch.twins.equations import (
     meet_start,
 )
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
+from tools.mismatch.twins.forced import shot_to_repeat
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import remember

@@ -39,6 +39,58 @@ class Matrices:
     hold: Hold
 
 
+@dataclass(frozen=True)
+class PoleBlocks:
+    """Describes a plant by its poles: ``modes``, grouped in ``chains``, each chain one companion block.
+
+    ``bounds`` are the first row and the last row + 1 of each block, ``sizes`` its typical rate in rad/s; ``place`` is
+    where the parameters of a mode begin in theta (a fixed mode has none).
+    """
+
+    modes: Sequence[Mode]
+    chains: Sequence[Sequence[int]]
+    bounds: tuple[tuple[int, int], ...]
+    sizes: tuple[float, ...]
+    place: Mapping[int, int]
+    discrete: bool
+    dt: float
+
+    def plant(self, theta: Array) -> Plant:
+        """Return the block-diagonal plant for pole parameters ``theta``."""
+        order = self.bounds[-1][1] if self.bounds else 0
+        a, b = np.zeros((order, order)), np.zeros(order)
+        for chain, size, (first, last) in zip(self.chains, self.sizes, self.bounds, strict=True):
+            roots = np.concatenate([self._roots(i, theta) for i in chain])
+            a[first:last, first:last], b[first:last] = companion(roots, size, self.discrete)
+        return Plant(a, b, self.bounds if len(self.bounds) > 1 else ())
+
+    def _roots(self, i: int, theta: Array) -> Complex:
+        mode = self.modes[i]
+        if mode.kind == "fixed":
+            return roots_of_mode(mode, self.discrete, self.dt)
+        at = self.place[i]
+        if mode.kind == "pair":
+            w, z = theta[at], theta[at + 1]
+            value = complex(-z * w, w * np.sqrt(max(1 - z * z, 0.0)))
+        else:
+            value = complex(float(np.sign(mode.value.real)) * theta[at])
+        return roots_of_mode(Mode(mode.kind, value), self.discrete, self.dt)
+
+
+class _Start:
+    """Collects the parameters of a twin and the values from which their fit begins."""
+
+    def __init__(self) -> None:
+        self.parameters: list[Parameter] = []
+        self.values: list[float] = []
+
+    def add(self, parameter: Parameter, value: float) -> int:
+        """Add a parameter; returns its place in theta."""
+        self.parameters.append(parameter)
+        self.values.append(value)
+        return len(self.values) - 1
+
+
 def state_space_twin(recording: Recording) -> DynamicTwin:
     """Build the twin; theta = pole parameters, scaled numerator coefficients, y0 of every output."""
     m = without_constant(read_matrices(recording), recording.dt)
@@ -50,83 +102,11 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
             f"{recording.path}: [twin.parameters] A has {poles.size} modes that inputs move and outputs show;"
             f" at most {MAX_ORDER} are handled"
         )
-    s = poles.size
-    modes = modes_of(poles, m.discrete, dt)
-    chains = chains_of(modes, dt)
-    blocks: list[tuple[int, int]] = []
-    for chain in chains:
-        at = blocks[-1][1] if blocks else 0
-        blocks.append((at, at + sum(modes[i].order for i in chain)))
-    omegas = [
-        typical_size(np.concatenate([roots_of_mode(modes[i], m.discrete, dt) for i in c]), recording.n * dt)
-        for c in chains
-    ]
-    free = [mode for mode in modes if mode.kind != "fixed"]
-    parameters: list[Parameter] = []
-    begin: list[float] = []
-    place: dict[int, int] = {}
-    for i, mode in enumerate(modes):
-        if mode.kind == "fixed":
-            continue
-        tag = f"_{free.index(mode) + 1}" if len(free) > 1 else ""
-        place[i] = len(parameters)
-        if mode.kind == "pair":
-            w, z = abs(mode.value), -mode.value.real / abs(mode.value)
-            # a plant that is stable as given stays stable
-            least = 0.0 if z >= 0 else -0.5
-            parameters.append(Parameter(f"natural_frequency{tag}", "rad/s", w / 30, w * 30, True, scale=0.01 * w))
-            parameters.append(Parameter(f"damping_ratio{tag}", "1", least, 0.9999, scale=max(0.02 * abs(z), 1e-3)))
-            begin += [w, z]
-        else:
-            r = abs(mode.value.real)
-            parameters.append(Parameter(f"pole_rate{tag}", "1/s", r / 100, r * 100, True, scale=0.01 * r))
-            begin.append(r)
-
-    def roots_of(i: int, theta: Array) -> Complex:
-        mode = modes[i]
-        if mode.kind == "fixed":
-            return roots_of_mode(mode, m.discrete, dt)
-        at = place[i]
-        if mode.kind == "pair":
-            w, z = theta[at], theta[at + 1]
-            value = complex(-z * w, w * np.sqrt(max(1 - z * z, 0.0)))
-        else:
-            value = complex(float(np.sign(mode.value.real)) * theta[at])
-        return roots_of_mode(Mode(mode.kind, value), m.discrete, dt)
-
-    def plant_of(theta: Array) -> Plant:
-        a, b = np.zeros((s, s)), np.zeros(s)
-        for chain, omega, (first, last) in zip(chains, omegas, blocks, strict=True):
-            roots = np.concatenate([roots_of(i, theta) for i in chain])
-            a[first:last, first:last], b[first:last] = companion(roots, omega, m.discrete)
-        return Plant(a, b, tuple(blocks) if len(blocks) > 1 else ())
-
-    rows = _numerators(m, plant_of(np.array(begin)), poles)
-    links: list[Link] = []
-    single = len(inputs) * len(outputs) == 1
-    for i, u in enumerate(inputs):
-        for k, o in enumerate(outputs):
-            c, direct = rows[k, i]
-            unit = f"{recording.unit[o]}/({recording.unit[u]})"
-            for first, last in blocks:
-                worst = float(np.max(np.abs(c)))
-                for r in range(first, last):
-                    if worst > 0 and abs(c[r]) > 1e-7 * worst:
-                        name = f"numerator_{r}" if single else f"numerator_{r}[{u},{o}]"
-                        links.append(Link(len(parameters), o, u, r))
-                        # nearly cancelling numerators have arbitrary sizes: the trust region is as wide as theirs
-                        parameters.append(Parameter(name, unit, scale=max(abs(c[r]), 1e-3 * worst)))
-                        begin.append(float(c[r]))
-            if direct != 0.0:
-                links.append(Link(len(parameters), o, u, -1))
-                parameters.append(Parameter(f"direct[{u},{o}]", "1", scale=abs(direct)))
-                begin.append(float(direct))
-    for k, o in enumerate(outputs):
-        links.append(Link(len(parameters), o, CONSTANT, -2))
-        typical = 0.01 * float(np.std(recording.outputs[o]))
-        parameters.append(Parameter("y0" if len(outputs) == 1 else f"y0[{o}]", recording.unit[o], scale=typical))
-        begin.append(float(m.y0[k]))
-
+    start = _Start()
+    blocks = _pole_blocks(m, poles, recording, start)
+    n_poles = len(start.values)
+    links = _links(_numerators(m, blocks.plant(np.array(start.values)), poles), m.y0, blocks, recording, start)
+    parameters = tuple(start.parameters)
     settled: dict[int, dict[str, Array]] = {}
 
     def fixed_free(n: int) -> Mapping[str, Array]:
@@ -141,49 +121,107 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
             settled[n] = {o: y[:, k] for k, o in enumerate(outputs)}
         return settled[n]
 
-    n_poles = len(parameters) - len(links)
-
     def human_of(theta: Array) -> Sequence[Human]:
         out = [Human(p.name, float(v), p.unit) for p, v in zip(parameters[:n_poles], theta, strict=False)]
-        if np.all(np.abs(np.linalg.eigvals(plant_of(theta).a) - (1.0 if m.discrete else 0.0)) > 1e-9):
-            for (k, i), g in np.ndenumerate(_dc_gain(plant_of(theta), links, theta, inputs, outputs, m.discrete)):
+        plant = blocks.plant(theta)
+        if np.all(np.abs(np.linalg.eigvals(plant.a) - (1.0 if m.discrete else 0.0)) > 1e-9):
+            for (k, i), g in np.ndenumerate(_dc_gain(plant, links, theta, inputs, outputs, m.discrete)):
                 tag = "" if len(inputs) * len(outputs) == 1 else f"[{inputs[i]},{outputs[k]}]"
-                out.append(
-                    Human(f"dc_gain{tag}", float(g), f"{recording.unit[outputs[k]]}/{recording.unit[inputs[i]]}")
-                )
-        out += [
-            Human(p.name, float(v), p.unit) for p, v in zip(parameters, theta, strict=True) if p.name.startswith("y0")
-        ]
-        return out
+                unit = f"{recording.unit[outputs[k]]}/{recording.unit[inputs[i]]}"
+                out.append(Human(f"dc_gain{tag}", float(g), unit))
+        offsets = [(p, v) for p, v in zip(parameters, theta, strict=True) if p.name.startswith("y0")]
+        return out + [Human(p.name, float(v), p.unit) for p, v in offsets]
 
     def text_of(theta: Array) -> dict[str, object]:
-        return _text(plant_of(theta), links, theta, inputs, outputs, m)
+        return _text(blocks.plant(theta), links, theta, inputs, outputs, m)
 
     continuous = list(poles) if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
     # an oscillating mode does not integrate, however lightly it is damped
     slowest = min((abs(p) if abs(p.imag) > 1e-9 * abs(p) else -p.real for p in continuous), default=np.inf)
-    seen = tuple(first for first, _ in blocks)
+    seen = tuple(first for first, _ in blocks.bounds)
     return DynamicTwin(
         kind="state_space",
         inputs=inputs,
         outputs=outputs,
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
-        parameters=tuple(parameters),
+        parameters=parameters,
         hold="discrete" if m.discrete else m.hold,
-        links=tuple(links),
-        groups=tuple({o: seen} for o in outputs) if s else (),
-        begin=np.array(begin),
-        plant_of=plant_of,
+        links=links,
+        groups=tuple({o: seen} for o in outputs) if poles.size else (),
+        begin=np.array(start.values),
+        plant_of=blocks.plant,
         fixed_free=fixed_free,
         human_of=human_of,
         text_of=text_of,
         restart=bool(slowest * recording.n * dt < INTEGRATES),
-        feedback_on=outputs[0] if len(inputs) == 1 and s else "",
+        feedback_on=outputs[0] if len(inputs) == 1 and poles.size else "",
         fastest_per_s=float(np.max(np.abs(continuous))) if continuous else 0.0,
         start_given="x0" in recording.twin.parameters,
         at_rest="x0" in recording.twin.parameters and not np.any(m.x0),
     )
+
+
+def _pole_blocks(m: Matrices, poles: Complex, recording: Recording, start: _Start) -> PoleBlocks:
+    """Group the poles in blocks, and add the parameters of their modes to ``start``."""
+    dt = recording.dt
+    modes = modes_of(poles, m.discrete, dt)
+    chains = chains_of(modes, dt)
+    bounds: list[tuple[int, int]] = []
+    for chain in chains:
+        at = bounds[-1][1] if bounds else 0
+        bounds.append((at, at + sum(modes[i].order for i in chain)))
+    sizes = [
+        typical_size(np.concatenate([roots_of_mode(modes[i], m.discrete, dt) for i in c]), recording.n * dt)
+        for c in chains
+    ]
+    free = [i for i, mode in enumerate(modes) if mode.kind != "fixed"]
+    place: dict[int, int] = {}
+    for number, i in enumerate(free, start=1):
+        mode, tag = modes[i], f"_{number}" if len(free) > 1 else ""
+        if mode.kind == "pair":
+            w, z = abs(mode.value), -mode.value.real / abs(mode.value)
+            # a plant that is stable as given stays stable
+            least = 0.0 if z >= 0 else -0.5
+            frequency = Parameter(f"natural_frequency{tag}", "rad/s", w / 30, w * 30, True, scale=0.01 * w)
+            place[i] = start.add(frequency, w)
+            start.add(Parameter(f"damping_ratio{tag}", "1", least, 0.9999, scale=max(0.02 * abs(z), 1e-3)), z)
+        else:
+            r = abs(mode.value.real)
+            place[i] = start.add(Parameter(f"pole_rate{tag}", "1/s", r / 100, r * 100, True, scale=0.01 * r), r)
+    return PoleBlocks(modes, chains, tuple(bounds), tuple(sizes), place, m.discrete, dt)
+
+
+def _links(
+    rows: Mapping[tuple[int, int], tuple[Array, float]],
+    y0: Array,
+    blocks: PoleBlocks,
+    recording: Recording,
+    start: _Start,
+) -> tuple[Link, ...]:
+    """Add numerators ``rows``, direct terms and offsets ``y0`` to ``start``; returns what connects them to outputs."""
+    inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
+    links: list[Link] = []
+    single = len(inputs) * len(outputs) == 1
+    for i, u in enumerate(inputs):
+        for k, o in enumerate(outputs):
+            c, direct = rows[k, i]
+            unit = f"{recording.unit[o]}/({recording.unit[u]})"
+            worst = float(np.max(np.abs(c), initial=0.0))
+            for r in (r for first, last in blocks.bounds for r in range(first, last)):
+                if worst > 0 and abs(c[r]) > 1e-7 * worst:
+                    name = f"numerator_{r}" if single else f"numerator_{r}[{u},{o}]"
+                    # nearly cancelling numerators have arbitrary sizes: the trust region is as wide as theirs
+                    numerator = Parameter(name, unit, scale=max(abs(c[r]), 1e-3 * worst))
+                    links.append(Link(start.add(numerator, float(c[r])), o, u, r))
+            if direct != 0.0:
+                term = Parameter(f"direct[{u},{o}]", "1", scale=abs(direct))
+                links.append(Link(start.add(term, float(direct)), o, u, -1))
+    for k, o in enumerate(outputs):
+        typical = 0.01 * float(np.std(recording.outputs[o]))
+        offset = Parameter("y0" if len(outputs) == 1 else f"y0[{o}]", recording.unit[o], scale=typical)
+        links.append(Link(start.add(offset, float(y0[k])), o, CONSTANT, -2))
+    return tuple(links)
 
 
 def _matrix(recording: Recording, key: str, shape: tuple[int | None, int | None], missing: Array | None) -> Array:

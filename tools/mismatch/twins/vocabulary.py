@@ -11,7 +11,6 @@ from typing import Literal
 from hal import plugins
 
 Role = Literal["input", "output", "context"]
-_AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,8 @@ noise_rms = 0.02
 
 `hold = "zero"` says that a computer held the force over each sample. Without it the report names friction here, and the
 verdict is `unexplained`. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
+One `hold` counts for all inputs: beside a held command a measured one looks half a sample late, and a small part of
+an effect may go to a more general one.
 
 Your own equations are text, or a Python function that is traced once ([a twin of your own](adding/twin.md)). An output
 with the name of a state is converted to its unit, and forces are tried at every state:

@@ -6,13 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tools.research.reproduce.measured_sets import SETS
 from tools.research.reproduce.rows import Row
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

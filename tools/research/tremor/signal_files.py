@@ -49,12 +49,9 @@ def read_file(path: Path) -> Iterator[TremorSignal]:
 
 
 def _csv(path: Path) -> dict[str, Array]:
-    from tools.mismatch.recording_columns import read_columns
+    from tools.mismatch.recording_columns import column_names, read_columns
 
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        head = file.readline()
-    delimiter = next((d for d in ",;\t" if d in head), ",")
-    names = [name.strip().strip('"') for name in head.split(delimiter)]
+    names = column_names(path)
     wanted = [name for name in names if name in _TIMES or _unit_of(name)]
     if not wanted:
         raise InputError(f"{path}: no column ends in a unit (_g, _m_s2, _deg_s, _um, ...); the header is: {names}")

@@ -10,14 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tools.errors import InputError
 from tools.research.tremor import signal_files, signal_sets
 from tools.research.tremor.signal import TremorSignal
-
-Array = NDArray[np.float64]
 
 DATA_SETS = ("tremor_duke_adxl345", "tremor_paradigma_pd", "tremor_mouse_lsm9ds1")
 SHORTEST_S = 4.0
