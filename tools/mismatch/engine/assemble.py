@@ -318,10 +318,10 @@ def summary(
         return text
     if decision.meaning == "place_not_reachable" and physics and all(imitable(physics, problem.twin)):
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
-        least = all(b[o] <= MUCH_LEFT * decision.floors[o][1] for o in guilty)
+        least = ", down to the noise," if all(b[o] <= MUCH_LEFT * decision.floors[o][1] for o in guilty) else ""
         return (
-            f"What {names} explains of {outputs}{', down to the noise,' if least else ''} may also be a wrong parameter of"
-            " the simulation that made the columns."
+            f"What {names} explains of {outputs}{least} may also be a wrong parameter of the simulation that made the"
+            " columns."
         )
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
     if decision.meaning == "floor_doubtful":

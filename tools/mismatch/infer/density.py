@@ -205,6 +205,8 @@ def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Plac
     with_it = evidence.one_step(problem, fitted, output)
     with_it -= one * sum(figures(fitted.model.placed[k], fitted) for k in own)
     r = undone(problem, fitted, output, own)
+    if not np.all(np.isfinite(r)):
+        return False  # without them the simulation runs away, and no curve of a signal makes up for that
     bare = max(with_it, nats(innovations(r - np.median(r[learned]), learned)))
     for columns in recorded(problem, fitted, output):
         design = np.column_stack([np.ones(r.size), columns])
