@@ -202,6 +202,7 @@ STROKE = LAYOUT.start("stroke")
 COMMAND = LAYOUT.start("command")
 CLIP = LAYOUT.start("clip")
 STATUS = LAYOUT.start("status")
+SIZE = LAYOUT.size
 
 STALE = int(FrameStatus.STALE)
 SATURATED = int(FrameStatus.SATURATED)

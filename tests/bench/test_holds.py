@@ -135,7 +135,7 @@ def test_four_bands_beside_scipy(page: Any):
 def test_each_instrument_says_its_holds_in_its_own_column():
     rows = np.zeros((3, endoscope_frame.LAYOUT.size))
     rows[1, endoscope_frame.HELD] = 1.0
-    rows[2, endoscope_frame.STATUS] = float(FrameStatus.HELD)  # there, the status is that of the card
+    rows[2, endoscope_frame.OUTPUTS] = float(FrameStatus.HELD)  # there, the status is that of the card
     names = endoscope_frame.LAYOUT.scalar_names()
     assert endoscope_frame.LAYOUT.read_holds(names, rows).tolist() == [False, True, False]
     assert not LAYOUT.read_holds(("t", "volts_0"), np.ones((4, 2))).any(), "a recording without a status has no holds"

@@ -135,10 +135,8 @@ def _npz_columns(path: Path, names: list[str] | None = None) -> tuple[dict[str, 
                     others[name] = f"{a.dtype} of shape {a.shape}"
     except RecordingError:
         raise
-    except OSError as error:
-        raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}; save plain numeric arrays (no pickled objects)") from None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}; write it again with numpy.savez, as plain numbers") from None
     return columns, others
 
 

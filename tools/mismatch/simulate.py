@@ -209,7 +209,7 @@ class Model:
 
         ``only`` restricts the outputs (None: all).
         """
-        flow = self._flow(view_run(self.twin, view), Pass(theta, True), only=only)
+        flow = self._courses(view_run(self.twin, view), Pass(theta, True), only=only)[0]
         return {o: view.take(s.value) for o, s in flow.items()}
 
     def in_front(self, view: View, theta: Array) -> dict[str, Array]:
@@ -222,7 +222,7 @@ class Model:
         key = ("whole", self.key, theta.tobytes())
 
         def make() -> Array:
-            flow = self._flow(view_run(self.twin, view), Pass(theta, True))
+            flow = self._courses(view_run(self.twin, view), Pass(theta, True))[0]
             return np.stack([flow[o].value for o in self.twin.outputs])
 
         return dict(zip(self.twin.outputs, remember(view.memo, key, make), strict=True))
@@ -250,7 +250,7 @@ class Model:
         if samples is not None and isinstance(self.twin, DynamicTwin) and all(p.site != "output" for p in self.placed):
             # no effect needs the course of an output
             run = replace(run, wanted=samples)
-        flow = self._flow(run, Pass(theta, False), only=only)
+        flow = self._courses(run, Pass(theta, False), only=only)[0]
         keep = set(self.linear)
         constant: dict[str, Array] = {}
         columns: dict[str, Array] = {}
@@ -307,17 +307,7 @@ class Model:
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
         """Return the outputs for given inputs and further forces, with this model as the base physics of another."""
-        return self._flow(run, Pass(theta, join), inputs, forces)
-
-    def _flow(
-        self,
-        run: Run,
-        how: Pass,
-        given: Mapping[str, Signal] | None = None,
-        beside: Sequence[Force] = (),
-        only: Collection[str] | None = None,
-    ) -> dict[str, Signal]:
-        return self._courses(run, how, given, beside, only)[0]
+        return self._courses(run, Pass(theta, join), inputs, forces)[0]
 
     def _courses(
         self,
@@ -466,7 +456,7 @@ class Model:
         theta = np.array([middle(f) for f in self._free])
         folded: set[int] = set()
         with np.errstate(all="ignore"):
-            flow = self._flow(run, Pass(theta, False, folded))
+            flow = self._courses(run, Pass(theta, False, folded))[0]
         found = {j for s in flow.values() for j in s.columns}
         return found - folded
 

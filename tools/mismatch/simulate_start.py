@@ -95,10 +95,10 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
     without = rest.carry(model, believed, view.recording)
     x, ctx = probe_signals(rest, view, without, pl, pl.outputs[0])
     guesses = pl.effect.guess(x, full_residual(rest, view, without, pl.outputs[0]), ctx, pl.settings)
-    there = [believed.copy() for _ in guesses[:2]]
-    for th, q in zip(there, guesses, strict=False):
+    own = [believed.copy() for _ in guesses[:2]]
+    for th, q in zip(own, guesses, strict=False):
         th[a] = q
-    for th in (*found, *there):
+    for th in (*found, *own):
         other = th.copy()
         other[: model.n_base] = given
         if b.stop > b.start and b.start not in model.linear:
