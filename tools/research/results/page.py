@@ -49,7 +49,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-false-alarms": (),
     "mismatch-foreign": (),
     "mismatch-measured": (),
-    "mismatch-gate": ("First run", "Weights that share", "Sealed corpus, walks"),
+    "mismatch-gate": ("First run", "Sealed corpus, walks", "Sure learned", "Start states"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
     "together": ("Not named",),
