@@ -14,7 +14,7 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.screen import places
-from tools.mismatch.infer import diagnose
+from tools.mismatch.infer import density, diagnose
 from tools.mismatch.infer.constants import START, Constants, learned
 from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.decide import TESTED, accepted, dispensable, is_whole, log_odds, stated, surenesses
@@ -198,6 +198,16 @@ def test_a_walk_is_no_account_of_what_a_signal_explains_one_step_ahead(follows: 
     walk = store.with_one(store.base, place)
     assert store.outdone(walk, store.sets.values()) == follows
     assert ("random_walk" in store.ranked()[0].names) != follows
+
+
+def test_a_set_without_whose_drift_the_simulation_runs_away_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inside a loop the simulation without the drift may diverge; it ended the diagnosis with an error of lstsq."""
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    r = _stack(0.4 * np.linspace(0.0, 1.0, N) ** 2, u)
+    store = infer(r, START, jobs=1, effects=[EFFECTS["thermal_drift"]]).found.store
+    drift = next(s for s in store.ranked() if s.names == {"thermal_drift"})
+    monkeypatch.setattr(density, "undone", lambda problem, *_: np.full(problem.index.size, np.nan))
+    assert store.scored(drift.fitted).proper
 
 
 class _Ranked:

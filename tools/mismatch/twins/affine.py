@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
-from sim_devices.physics.exponential import exponential
 from tools.guest.equations import ADD, ATAN2, DIV, LEQ, LESS, MAX, MIN, MUL, NEG, PICK, POW, SUB, Program
+from tools.mismatch.twins.linear import discretise
 
 CONSTANT, AFFINE, CURVED = 0, 1, 2
 """How a register depends on the states and signals."""
@@ -64,23 +64,21 @@ class Steps:
 def exact_steps(rates: Callable[[Array, Array], Array], typical: Array, signals: Array, dt: float, held: bool) -> Steps:
     """Return the exact steps of affine derivatives ``rates(x, u)`` (s,) for signals that are held or straight.
 
-    ``typical`` (s,) and ``signals`` (m,): sizes of states and signals. Van Loan, IEEE Trans. Automatic Control 23
-    (1978) 395: blocks of one matrix exponential.
+    ``typical`` (s,) and ``signals`` (m,): sizes of states and signals.
     """
     s, m = typical.size, signals.size
     size = np.concatenate([typical, np.abs(signals)])
     size = np.where(size > 0.0, size, 1.0)
     own = size[:s]
     slope = np.stack([0.5 * (rates(d[:s], d[s:]) - rates(-d[:s], -d[s:])) for d in np.diag(size)], axis=1)
-    # states and signals in units of their sizes
-    block = np.zeros((s + 2 * (m + 1), s + 2 * (m + 1)))
-    block[:s, : s + m] = slope * dt / own[:, None]
-    block[:s, s + m] = rates(np.zeros(s), np.zeros(m)) * dt / own
-    block[s : s + m + 1, s + m + 1 :] = np.eye(m + 1)
-    e = exponential(block)[:s] * own[:, None]
-    of_held, ramp = e[:, s : s + m] / size[s:], e[:, s + m + 1 : -1] / size[s:]
-    late = np.zeros((s, m)) if held else ramp
-    return Steps(np.ascontiguousarray(e[:, :s] / own), of_held - late, late, e[:, s + m])
+    # states and signals in units of their sizes; the last signal is the constant one
+    a = slope[:, :s] / own[:, None]
+    b = np.column_stack([slope[:, s:], rates(np.zeros(s), np.zeros(m))]) / own[:, None]
+    each = [discretise(a, column, dt, "zero" if held else "linear") for column in b.T]
+    before = np.stack([d.g0 for d in each], axis=1) * own[:, None]
+    after = np.stack([d.g1 for d in each], axis=1) * own[:, None]
+    ad = each[0].ad * own[:, None] / own
+    return Steps(ad, before[:, :m] / size[s:], after[:, :m] / size[s:], before[:, m] + after[:, m])
 
 
 @kernel
