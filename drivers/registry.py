@@ -1,9 +1,15 @@
 """Finds drivers by the name that a bench file uses. Each is one record, imported when a bench names it.
 
 A driver is found in one of three places, in this order: ``BUILT_IN``; a folder ``drivers/NAME`` whose module ``driver``
-holds ``DRIVER``; an entry point of group ``micron.drivers`` of another package. The record is the same everywhere.
-``hal.plugins.Registry`` searches them. A name of the first two cannot be replaced, and two packages that offer one name
-are refused.
+holds ``DRIVER``; an entry point of another package, which declares in its ``pyproject.toml``::
+
+    [project.entry-points."micron.drivers"]
+    my_dac = "my_package.my_dac:DRIVER"
+
+The record is the same everywhere, and no file here changes (``docs/adding/i2c-dac.md`` writes one, and its emulator).
+``hal.plugins.Registry`` searches the three. A package cannot replace a name of the first two: its entry is ignored. If
+two packages offer one name, a bench that uses this name is refused with a message that names both packages.
+Drivers, ``firmware_py`` and ``tools`` may import this module; ``hal`` and ``sim_devices`` may not.
 """
 
 from __future__ import annotations

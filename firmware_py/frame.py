@@ -39,7 +39,7 @@ class Column:
         return slice(self.start, self.start + self.size)
 
     def scalar_names(self) -> tuple[str, ...]:
-        """``name_part`` for every scalar, or the bare name."""
+        """Return ``name_part`` for every scalar, or the bare name."""
         return tuple(f"{self.name}_{part}" for part in self.parts) or (self.name,)
 
 
@@ -70,8 +70,8 @@ _QUANTITIES: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("tremor_amplitude", "m", XYZ, "amplitude of the estimated tremor"),
     ("confidence", "1", XYZ, "0 not settled .. 1 the estimate explains the signal"),
     ("desired_tip", "m", XYZ, "wanted displacement of the tip, manipulator frame"),
-    ("stroke", "m", ("1", "2", "3"), "wanted actuator strokes from neutral"),
-    ("command", "V", ("1", "2", "3"), "amplifier output voltages"),
+    ("stroke", "m", ("1", "2", "3"), "wanted actuator strokes from neutral; actuation/stage.py turns them into volts"),
+    ("command", "V", ("1", "2", "3"), "amplifier output voltages; the driver divides by the gain"),
     ("clip", "bits", (), "Clip"),
     ("status", "bits", (), "FrameStatus"),
 )
@@ -92,8 +92,8 @@ class FrameStatus(IntFlag):
     MANUAL = 256  # the command was chosen by hand (bench page), not computed
     JERK = 512  # the hand twitches: a burst between voluntary motion and tremor
     DRIFT = 1024  # acceleration has stayed away from zero: bias or attitude drifts
-    HELD = 4096  # a hold: the command is the ramp to neutral, or neutral (loop)
     FALLBACK = 2048  # the chosen kinematics could not be used: this tick is the other one's solution
+    HELD = 4096  # a hold: the command is the ramp to neutral, or neutral (loop)
 
 
 class Clip(IntFlag):
@@ -167,7 +167,7 @@ class Layout:
         return np.asarray((words & self._held_bits) != 0)
 
     def new_frame(self) -> NDArray[np.float64]:
-        """A frame of zeros."""
+        """Return a frame of zeros."""
         return np.zeros(self.size)
 
 

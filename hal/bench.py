@@ -140,7 +140,8 @@ def named_packages(description: BenchDescription) -> list[str]:
     tremor: Any = description.firmware.get("tremor")
     methods = {str(cast(Any, tremor).get("method"))} if isinstance(tremor, dict) else set[str]()
     for group, names in ((plugins.DRIVERS, drivers), (plugins.DEVICES, drivers), (plugins.ESTIMATORS, methods)):
-        targets += [entry.value for name, entry in plugins.offered(group).items() if name in names]
+        entries = (plugins.find_entry(group, name) for name in sorted(names & plugins.offered(group).keys()))
+        targets += [entry.value for entry in entries if entry is not None]
     return targets
 
 

@@ -26,24 +26,31 @@ _Kind = TypeVar("_Kind")
 
 
 def offered(group: str) -> Mapping[str, EntryPoint]:
-    """Return the entry points of ``group`` by name, not loaded. Raises ``BenchError`` when two packages offer a
-    name."""
-    entries: dict[str, EntryPoint] = {}
-    for entry in entry_points(group=group):
-        other = entries.setdefault(entry.name, entry)
-        if other.value != entry.value:
-            raise BenchError(
-                f"'{entry.name}' of {group} is offered twice ({other.value}, {entry.value}): uninstall one package"
-            )
-    return entries
+    """Return the entry points of ``group`` by name, not loaded. Of a name that two packages offer, it holds one."""
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def find_entry(group: str, name: str) -> EntryPoint | None:
+    """Return the entry point ``name`` of ``group``, not loaded, or ``None`` when no package offers it.
+
+    Raises ``BenchError`` when two packages offer the name. Other names of the group do not matter."""
+    entries = {entry.value: entry for entry in entry_points(group=group, name=name)}
+    if len(entries) > 1:
+        packages = " and ".join(f"{_package(entry)} ({value})" for value, entry in entries.items())
+        raise BenchError(f"'{name}' of {group} is offered twice, by {packages}: uninstall one of the packages")
+    return next(iter(entries.values()), None)
+
+
+def _package(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else "an unnamed package"
 
 
 def load(group: str, name: str, kind: type[_Kind]) -> _Kind | None:
     """Return the object behind ``name``, which must be a ``kind``, or ``None`` when no package offers it.
 
-    Raises ``BenchError`` with the cause when the package is broken.
+    Raises ``BenchError`` with the cause when the package is broken or another one offers the name, too.
     """
-    entry = offered(group).get(name)
+    entry = find_entry(group, name)
     return None if entry is None else _load(group, name, entry, kind)
 
 

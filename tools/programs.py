@@ -157,7 +157,7 @@ def _named_by(path: Path) -> Iterator[Named]:
         if file.suffix.lower() in (".py", ".fmu") and file.is_file():
             yield Program(path, file)
     kind = _twin(path, table).get("kind")
-    entry = plugins.offered(plugins.TWINS).get(kind) if isinstance(kind, str) else None
+    entry = plugins.find_entry(plugins.TWINS, kind) if isinstance(kind, str) else None
     targets = [entry.value] if entry is not None else []
     bench = _bench(path, table)
     for target in [*targets, *(named_packages(bench) if bench else ())]:

@@ -1,4 +1,4 @@
-"""The actuation stage: predicted tremor -> wanted tip displacement -> strokes -> voltages."""
+"""Runs the actuation stage: predicted tremor -> wanted tip displacement -> strokes -> amplifier output voltages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TAPS = 16  # the most that a configuration may have; one size, one compilation
 
 @record
 class ActuateParams:
-    """The numbers of the stage."""
+    """Holds the parameters of the stage."""
 
     gain: float = field("1")
     ramp_step: float = field("1")
@@ -78,7 +78,7 @@ class ActuateParams:
 
 @record
 class ActuateState:
-    """The state of the stage."""
+    """Holds the state of the stage."""
 
     on: Array = field("1", 3)  # 0 .. 1, how far compensation of each axis is switched on
     tilt: Array = field("rad", 2)  # of the shaft, where the next inverse kinematics starts
@@ -264,7 +264,7 @@ def rest_kernel(states: Records[ActuateState]) -> None:
 
 
 class Actuation:
-    """The actuation stage with its state; ``step`` works on one frame."""
+    """Holds the actuation stage with its state; ``step`` works on one frame."""
 
     def __init__(self, config: ActuationConfig) -> None:
         self.config = config

@@ -29,10 +29,13 @@ Work = Callable[[TickInfo], object]
 class TaskRow:
     """Describes a task of an instrument.
 
-    ``rate``: ticks of a frame and runs in it; ``None`` means that this bench has no device for the task.
-    ``phase``: tick that is tried first. ``budget_us``: longest run it promises. ``deferrable``: ticks in a row for
-    which it may be put off. ``catch_up``: runs for every scan of a block that arrived late. ``deadline_ticks``: periods
-    after which a run counts as late.
+    ``rate``: ``Polls(10)`` runs the task in every 10th tick, ``Polls(10, 3)`` three times in 10 ticks; ``None`` means
+    that this bench has no device for the task. ``phase``: tick that is tried first. ``budget_us``: longest run it
+    promises. ``deferrable``: ticks in a row for which it may be put off. ``catch_up``: runs for every scan of a block
+    that arrived late. ``deadline_ticks``: periods after which a run counts as late.
+
+    If ``work`` raises, the run ends: the rest of the tick's tasks are skipped and the outputs ramp to neutral
+    (``Loop.run``). A task that can go on catches its ``HalError`` and reports a ``Finding``.
     """
 
     name: str

@@ -54,7 +54,7 @@ LEAN_CORNER_HZ = 0.3
 
 @record
 class SenseParams:
-    """The numbers of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
+    """Holds the parameters of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
 
     calibration: Calibration = field("")
     kinematics: Kinematics = field("")
@@ -71,7 +71,7 @@ class SenseParams:
 
 @record
 class SenseState:
-    """The state of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
+    """Holds the state of the stage with ``n`` axes. ``attitude`` is the record of the chosen filter."""
 
     attitude: AttitudeState = field("")
     smoothed: Array = field("V, degC", 2)  # supply, temperature
@@ -145,11 +145,10 @@ def _redundancy(state: SenseState, param: SenseParams, frame: NDArray[np.float64
 
 @kernel
 def sense_kernel(frame: NDArray[np.float64], states: Records[SenseState], params: Records[SenseParams]) -> None:
-    """Fill the columns from ``volts`` to ``tip_displacement``; adds its bits to ``status``.
+    """Fill the columns from ``volts`` to ``tip_displacement`` and add the stage's bits to ``status``.
 
-    A sample that is not finite leaves estimates as they were and sets INVALID. After lost scans the attitude
-    coasts over the gap; after more than ``max_gap_ticks``, or with an
-    impossible rate, it aligns anew.
+    A sample that is not finite leaves estimates as they were and sets INVALID. After lost scans the attitude coasts
+    over the gap; after more than ``max_gap_ticks``, or with an impossible rate, it aligns anew.
     """
     state = states[0]
     param = params[0]
@@ -215,7 +214,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Records[SenseState], params
 
 
 class Sensing:
-    """The sensing stage with its state; ``step`` works on one frame."""
+    """Holds the sensing stage with its state; ``step`` works on one frame."""
 
     def __init__(self, config: SensingConfig) -> None:
         self.config = config

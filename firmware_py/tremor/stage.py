@@ -1,4 +1,11 @@
-"""Runs the tremor stage: acceleration of the tip -> tremor now, tremor over the loop's delay, frequency, confidence."""
+"""Runs the tremor stage: acceleration of the tip -> tremor now, tremor over the loop's delay, frequency, confidence.
+
+The band that an estimator passes is set by its own table of the bench, in Hz (``[firmware.tremor.adaptive]
+cancel_from_hz, cancel_to_hz``; ``config.py`` has the others). ``filter_cutoff_rad_s`` is not a setting: it states the
+RC filter in front of the accelerometers, in rad/s, and follows ``[firmware.sensing] filter_ohm, filter_farad``.
+
+A hold changes nothing here: the stage runs on with every sample and keeps all that it has learned.
+"""
 
 from __future__ import annotations
 
@@ -51,9 +58,9 @@ def estimate_kernel(
 
     Input: ``tip_acceleration`` (3,) in m/s^2 and ``angular_acceleration`` (3,) in rad/s^2, both in the body frame.
     The attitude (``quaternion``) says into which axes gravity carries the noise of a turn. Output per axis: tremor now,
-    tremor ``TremorConfig.loop_delay_s`` later, its core (the part that does not yield when
-    the stroke runs out) and amplitude in m, frequency in Hz, confidence from 0 to 1. ``params`` come from
-    ``TremorConfig`` (``estimator_params``); ``states`` is the memory of the estimator.
+    tremor ``TremorConfig.loop_delay_s`` later, its core (the part that does not yield when the stroke runs out) and
+    amplitude in m, frequency in Hz, confidence from 0 to 1. ``params`` come from ``TremorConfig``
+    (``estimator_params``); ``states`` is the memory of the estimator.
 
     Without a valid new sample the model runs on by itself, so that the prediction stays one for the present tick. After
     lost scans it runs over the gap; a gap of more than ``TremorConfig.max_gap_ticks`` restarts it. It also restarts
@@ -102,7 +109,7 @@ def estimate_kernel(
 
 @kernel
 def learn_kernel(frame: NDArray[np.float64], states: Records[EstimatorState], params: Records[EstimatorParams]) -> None:
-    """Do what ``estimate_kernel`` would begin the next tick with, see ``Family.learn``."""
+    """Run now the work with which ``estimate_kernel`` would begin the next tick; see ``Family.learn``."""
     estimator_learn(0, states[0], params[0])
 
 

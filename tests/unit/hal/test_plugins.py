@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hal.errors import BenchError
-from hal.plugins import load, offered
+from hal.plugins import load
 
 
 def install(folder: Path, package: str, entry: str) -> None:
@@ -44,7 +44,9 @@ def test_a_broken_package_is_named(folder: Path, entry: str, message: str):
 
 
 def test_one_name_from_two_packages_is_refused(folder: Path):
-    install(folder, "one", "x = math:pi")
+    install(folder, "one", "x = math:pi\ny = math:tau")
     install(folder, "two", "x = math:e")
-    with pytest.raises(BenchError, match=r"'x' of micron\.test is offered twice"):
-        offered("micron.test")
+    message = r"'x' of micron\.test is offered twice, by (one|two) \(.*\) and (one|two) \(.*\): uninstall one"
+    with pytest.raises(BenchError, match=message):
+        load("micron.test", "x", float)
+    assert load("micron.test", "y", float) == pytest.approx(6.28319, abs=1e-5), "only the doubled name is refused"

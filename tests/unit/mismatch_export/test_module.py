@@ -270,8 +270,8 @@ def test_a_program_of_the_users_is_wrapped(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     trust_package("lever_arm:Lever")
     kinds = {"lever": EntryPoint("lever", "lever_arm:Lever", plugins.TWINS)}
-    monkeypatch.setattr("tools.mismatch.twins.core.user_kinds", lambda: kinds)
-    monkeypatch.setattr("tools.mismatch.export.module.user_kinds", lambda: kinds)
+    monkeypatch.setattr("tools.mismatch.twins.core.find_user_kind", kinds.get)
+    monkeypatch.setattr("tools.mismatch.export.module.find_user_kind", kinds.get)
     given = {"arm": 3.0, "rad_per_V": 0.4, "offset": 0.1}
     rec = recording("lever", DT, {"drive": wave()}, {"lift": wave()}, {"drive": "V", "lift": "um"}, given)
     twin = corrected(rec, [*placements(rec, EFFECTS["backlash"])[:1], *placements(rec, EFFECTS["first_order_lag"])[:1]])

@@ -254,7 +254,7 @@ def test_user_twin_from_an_entry_point(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.syspath_prepend(str(tmp_path))
     entry = EntryPoint("squarer", "squarer_of_hers:Squarer", "micron.twins")
     module = importlib.import_module("tools.mismatch.twins.core")
-    monkeypatch.setattr(module, "user_kinds", lambda: {"squarer": entry})
+    monkeypatch.setattr(module, "find_user_kind", {"squarer": entry}.get)
     u = np.linspace(-1, 1, 60)
     rec = recording("squarer", 0.1, {"u": u}, {"y": u}, {}, {"gain": 3.0, "label": "x"})
     with pytest.raises(NotTrusted, match="squarer_of_hers"):

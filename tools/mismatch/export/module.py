@@ -27,7 +27,7 @@ from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.ode import OdeTwin
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.twins.static import StaticTwin
-from tools.mismatch.twins.vocabulary import user_kinds
+from tools.mismatch.twins.vocabulary import find_user_kind
 
 WIDTH = 110
 
@@ -341,7 +341,7 @@ class _Module:
     def _simulate(self, opaque: bool) -> list[str]:
         dt = numbers(self.recording.dt)
         used = [*self.twin.inputs, *self._contexts()]
-        user = user_kinds().get(self.twin.kind) if opaque else None
+        user = find_user_kind(self.twin.kind) if opaque else None
         head = f"def simulate(inputs, parameters=None, dt={dt}{', base=None' if opaque else ''}):"
         lines = [
             head,

@@ -15,7 +15,7 @@ from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.opaque import function_twin, user_twin
 from tools.mismatch.twins.state_space import read_matrices, state_space_twin
 from tools.mismatch.twins.static import static_twin
-from tools.mismatch.twins.vocabulary import user_kinds
+from tools.mismatch.twins.vocabulary import find_user_kind
 
 
 def core(recording: Recording) -> Twin:
@@ -51,7 +51,7 @@ def core(recording: Recording) -> Twin:
 
             return instrument_twin(recording)
         case _:
-            entry = user_kinds().get(kind)
+            entry = find_user_kind(kind)
             if entry is None:
                 raise RecordingError(f"{recording.path}: [twin] kind '{kind}' is unknown")
             return user_twin(recording, entry)

@@ -74,6 +74,12 @@ def user_kinds() -> Mapping[str, object]:
     return plugins.offered(plugins.TWINS)
 
 
+def find_user_kind(kind: str) -> object | None:
+    """Return the entry point of the twin ``kind`` of an installed package, not loaded. Raises ``BenchError`` when two
+    packages offer it."""
+    return plugins.find_entry(plugins.TWINS, kind)
+
+
 def vocabulary(kind: str) -> Vocabulary | None:
     """Return the vocabulary of a kind, None for an unknown one."""
     if kind in KINDS:
