@@ -144,6 +144,10 @@ if find_spec("tools.research") is not None:  # a source tree; the wheel does not
     INSIDE |= _research.INSIDE
 
 
+LIST_LINE = 90
+"""Longest line, in characters, that a help text has on purpose, as in a list of commands."""
+
+
 def _at(where: str) -> Any:
     module, _, attribute = where.partition(":")
     return getattr(import_module(module), attribute)
@@ -167,13 +171,22 @@ def _with_brackets(command: Any) -> Any:
     """Escape the help of ``command`` and return it: typer reads help as rich markup and leaves ``[firmware]`` out."""
     from rich.markup import escape
 
-    command.help = escape(command.help) if command.help else command.help
+    command.help = escape(_rejoin(command.help)) if command.help else command.help
     for parameter in command.params:
         if getattr(parameter, "help", None):
             parameter.help = escape(parameter.help)
     for inner in getattr(command, "commands", {}).values():
         _with_brackets(inner)
     return command
+
+
+def _rejoin(text: str) -> str:
+    """Return ``text`` with the lines joined that the width of a source file has cut; short lines stay apart."""
+    joined, before = "", ""
+    for line in text.splitlines():
+        joined += (" " if line and len(before) > LIST_LINE else "\n") + line
+        before = line
+    return joined.strip()
 
 
 class Helpful(TyperGroup):

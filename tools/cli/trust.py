@@ -13,10 +13,10 @@ from tools.cli.common import clear_errors, console, data_console
 from tools.errors import InputError
 
 TrustOption = Annotated[
-    bool, typer.Option("--trust", help="Run the programs that it names, now and later (docs/security.md).")
+    bool, typer.Option("--trust", help="Run the programs that the given file names, now and later (docs/security.md).")
 ]
 OutsideOption = Annotated[
-    bool, typer.Option("--allow-outside", help="Let it name files outside its folder, now and later.")
+    bool, typer.Option("--allow-outside", help="Let the given file name files outside its folder, now and later.")
 ]
 
 
