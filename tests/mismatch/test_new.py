@@ -274,3 +274,14 @@ def test_a_csv_of_500_mb_needs_little_memory(tmp_path: Path):
     used_kib, samples = map(int, done.stdout.split())
     assert samples == repeats * rows
     assert used_kib < 300 * 1024
+
+
+def test_a_time_in_ms_under_a_bare_name_is_told_by_its_consequence(tmp_path: Path):
+    data = csv(tmp_path / "a.csv", "t,force_N,x_mm", 1e3 * T, FORCE, X)
+    result = call(data)
+    assert result.exit_code == 0, result.output
+    said = result.stderr.replace("\n", " ")
+    assert f"the time in 't' is in s: {RATE / 1e3:g} samples per second" in said
+    assert f"if it is in ms, repeat with --rate {RATE:g}" in said
+    assert call(data, "--rate", f"{RATE:g}", "--force").exit_code == 0
+    assert 1 / load(tmp_path).dt == pytest.approx(RATE)

@@ -195,7 +195,9 @@ def new(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.toml", help="Default: recording.toml beside DATA.")
     ] = None,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Rate of a file without a time column.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Rate of the samples, in place of a column of time.")
+    ] = None,
     resample: Annotated[
         float | None, typer.Option(metavar="HZ", help="Bring the columns to even steps at this rate.")
     ] = None,

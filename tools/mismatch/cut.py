@@ -13,8 +13,10 @@ import numpy as np
 from hal.trust import allow_name, path_inside
 from tools.errors import InputError
 from tools.mismatch.recording import Array
-from tools.mismatch.recording_columns import read_columns
-from tools.mismatch.recording_load import LONGEST_GAP, MIN_SAMPLES, MIN_SPAN, descriptor, on_grid
+from tools.mismatch.recording_clock import LONGEST_GAP, in_seconds, on_grid
+from tools.mismatch.recording_columns import column_units, read_columns
+from tools.mismatch.recording_load import MIN_SAMPLES, descriptor
+from tools.mismatch.recording_ranges import MIN_SPAN
 from tools.toml_text import toml_text
 
 
@@ -56,7 +58,7 @@ def cut(
     columns = read_columns(data, list(dict.fromkeys([*names, *([clock] if isinstance(clock, str) else [])])))
     n = next(iter(columns.values())).size
     if isinstance(clock, str):
-        t = columns[clock]
+        t = in_seconds(clock, columns[clock], column_units(data).get(clock, ""))
     elif isinstance(text.get("rate_hz"), int | float) and text["rate_hz"] > 0:
         t = np.arange(n) / float(text["rate_hz"])
     else:

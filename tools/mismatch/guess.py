@@ -171,6 +171,7 @@ def guess(path: Path, kind: str = "") -> Guess:
     clock_unit = parts[clock][1] or "s" if clock else "s"
     if stamps is not None:
         time_column, rate_hz = _time_of(clock, clock_unit, stamps, broken, notes)
+        assumed = [f"{text}{_consequence(n, rate_hz)}" if is_assumed_clock(text, clock) else text for text in assumed]
     else:
         constants = {k: c.smallest for k, c in seen.items() if c.smallest == c.largest}
         time_column, rate_hz = clock, _rate_beside({**constants, **read_scalars(path)}, notes)
@@ -256,6 +257,21 @@ def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> t
         if np.ptp(steps) < 0.1 * np.median(steps) and not (np.median(steps) == 1.0 and np.ptp(steps) == 0.0):
             return first, f"'{first}' is the time in s, because it rises in even steps"
     return "", ""
+
+
+def is_assumed_clock(text: str, clock: str) -> bool:
+    """Return True if ``text`` is the assumption that the column ``clock`` is the time in s."""
+    return text.startswith((f"the time in '{clock}' is in s", f"'{clock}' is the time in s"))
+
+
+def _consequence(samples: int, rate_hz: float | None) -> str:
+    """Return what a time in s says of the recording, for a person who knows better."""
+    if rate_hz is None:
+        return ""
+    return (
+        f": {rate_hz:.4g} samples per second, {(samples - 1) / rate_hz:.4g} s in all;"
+        f" if it is in ms, repeat with --rate {1e3 * rate_hz:.6g}"
+    )
 
 
 def _forward(values: Array) -> float:

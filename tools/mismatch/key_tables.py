@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 
-from tools.mismatch import recording_load
+from tools.mismatch import recording_channels, recording_load
 from tools.mismatch.keys import CHANNEL, PARAMETERS, SPLIT, TOP, TWIN, Key, names
 
 
 def tables() -> Iterator[tuple[str, Sequence[Key]]]:
     """Yield (heading, keys) of every table of ``recording.toml`` except the twins' parameters."""
-    yield "Top of the file", listed(TOP, recording_load._TOP)
-    yield "`[[channels]]`", listed(CHANNEL, recording_load._CHANNEL)
+    yield "Top of the file", listed(TOP, recording_load.TOP_KEYS)
+    yield "`[[channels]]`", listed(CHANNEL, recording_channels.KEYS)
     yield "`[split]`", SPLIT
     yield "`[twin]`", TWIN
 

@@ -22,7 +22,12 @@ TOP = (
     Key("title", "text", "heading of the report", "the file's name"),
     Key("data", "file name", "the data: csv, tsv, txt, npz, mat, mcap, parquet, netCDF (.nc) or ASAM MDF (.mf4)"),
     Key("rate_hz", "number > 0", "uniform sampling rate", "from time_column"),
-    Key("time_column", "column name", "time stamps in seconds, for recordings without rate_hz", "none"),
+    Key(
+        "time_column",
+        "column name",
+        "time stamps, in s unless name or file state a unit (t_ms); for recordings without rate_hz",
+        "none",
+    ),
     Key("twin", "table", "the simulation that the recording is compared with"),
     Key("channels", "list of tables", "one per column that is used"),
     Key("segments", "list of samples", "where a new run begins: plants with states start there afresh", "one run"),

@@ -15,12 +15,13 @@ import numpy as np
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
 from tools.mismatch.cut import Stretch, cut_columns
-from tools.mismatch.guess import Guess, guess
+from tools.mismatch.guess import Guess, guess, is_assumed_clock
 from tools.mismatch.key_tables import of_kind
 from tools.mismatch.new_text import recording_text
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_columns import read_columns
-from tools.mismatch.recording_load import APART, from_table
+from tools.mismatch.recording_load import from_table
+from tools.mismatch.recording_ranges import APART
 from tools.mismatch.twins.vocabulary import KINDS, user_kinds, vocabulary
 from tools.output import check_writable, save_figure, write_text_atomic
 
@@ -74,9 +75,9 @@ def new_recording(
 ) -> NewRecording:
     """Guess what ``data`` holds and write the descriptor ``out`` (default: ``recording.toml`` beside it) and a picture.
 
-    ``kind``: the twin; ``rate_hz``: the rate of a file without time; ``resample_hz``: bring it to even steps at this
-    rate; ``cut``: at the usual rate. Both cut at gaps, and write the columns beside the descriptor. Nothing is written
-    where something is wrong. Raises InputError.
+    ``kind``: the twin; ``rate_hz``: the rate, in place of a column of time; ``resample_hz``: bring it to even steps at
+    this rate; ``cut``: at the usual rate. Both cut at gaps, and write the columns beside the descriptor. Nothing is
+    written where something is wrong. Raises InputError.
     """
     if kind and vocabulary(kind) is None:
         raise InputError(f"--twin {kind}: unknown kind; known kinds: {', '.join([*KINDS, *user_kinds()])}")
@@ -84,9 +85,8 @@ def new_recording(
     rewrites = cut or resample_hz is not None
     targets = _targets(data, out, rewrites, force)
     found = guess(data, kind)
-    if found.rate_hz is None and rate_hz is not None:
-        unknown = [text for text in found.unknown if not text.startswith("the rate: ")]
-        found = replace(found, rate_hz=rate_hz, unknown=unknown)
+    if rate_hz is not None:
+        found = _at_rate(found, rate_hz)
     found = replace(
         found, unknown=[*found.unknown, *_needed(found.kind)], assumed=[*found.assumed, *_left_out(found.kind)]
     )
@@ -101,6 +101,23 @@ def new_recording(
         _check(text, out, data, found, columns)
     _write(targets, text, found, data.name, columns)
     return NewRecording(out, targets[1], named, found, stretch)
+
+
+def _at_rate(found: Guess, rate_hz: float) -> Guess:
+    """Return the guess with the rate that a person stated, in place of a column of time."""
+    clock = found.clock
+    notes = [f"column '{clock}' is not used: the rate is given"] if clock else []
+    return replace(
+        found,
+        rate_hz=rate_hz,
+        clock="",
+        time_column="",
+        columns=[replace(c, role="") if c.role == "time" else c for c in found.columns],
+        unknown=[text for text in found.unknown if not text.startswith("the rate: ")],
+        assumed=[text for text in found.assumed if not (clock and is_assumed_clock(text, clock))],
+        broken=[text for text in found.broken if not text.startswith(f"the time in '{clock}'")],
+        notes=[*(n for n in found.notes if not (clock and n.startswith(f"column '{clock}' is the time"))), *notes],
+    )
 
 
 def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:

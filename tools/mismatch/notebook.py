@@ -135,8 +135,8 @@ class Recording:
         names that are both. ``time`` is the column of time in s, else ``rate_hz`` is needed. Units that the file has
         itself are used where ``units`` has none. Raises ``InputError``.
         """
+        from tools.mismatch.recording_clock import uniform
         from tools.mismatch.recording_columns import column_units, read_columns
-        from tools.mismatch.recording_load import uniform
 
         file = Path(path)
         named = {

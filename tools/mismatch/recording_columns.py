@@ -86,7 +86,7 @@ class _Format:
 
 def _format(path: Path) -> _Format:
     if not path.is_file():
-        raise RecordingError(f"{path}: data file does not exist; 'data' in the descriptor is relative to its folder")
+        raise RecordingError(f"{path}: data file does not exist; give its name, in a descriptor relative to its folder")
     if path.stat().st_size > MAX_BYTES:
         raise RecordingError(f"{path}: larger than {MAX_BYTES >> 30} GiB; cut the recording into parts")
     suffix = path.suffix.lower()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.recording_load import LONGEST_GAP, MOST_MISSING
+from tools.mismatch.recording_clock import LONGEST_GAP, MOST_MISSING
 
 Array = NDArray[np.float64]
 MOST_PLACES = 5

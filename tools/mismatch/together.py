@@ -12,7 +12,8 @@ import numpy as np
 from tools.errors import InputError, RecordingError
 from tools.mismatch.batch import find, is_folder_of_recordings
 from tools.mismatch.recording import Part, Recording, Split
-from tools.mismatch.recording_load import APART, load
+from tools.mismatch.recording_load import load
+from tools.mismatch.recording_ranges import APART
 
 CLOSE_RATE = 1e-6
 

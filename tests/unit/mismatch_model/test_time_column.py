@@ -9,7 +9,8 @@ import pytest
 
 from tests.recording_text import stack_channels
 from tools.errors import RecordingError
-from tools.mismatch.recording_load import load, on_grid
+from tools.mismatch.recording_clock import on_grid
+from tools.mismatch.recording_load import load
 
 TEXT = """format = 1
 data = "data.npz"
@@ -52,3 +53,43 @@ def test_noise_is_not_smoothed() -> None:
     stamps = np.sort(np.arange(4000) + rng.uniform(-0.3, 0.3, 4000))
     noise = rng.standard_normal(4000)
     assert np.std(on_grid(np.arange(4000.0), 1.0, stamps, noise)) == pytest.approx(np.std(noise), rel=0.01)
+
+
+TWINS = {
+    "mechanical_axis": ("force", "N", "position", "mm", "mass = 2.0\ndamping = 6.0\nstiffness = 120.0"),
+    "state_space": ("u", "V", "y", "V", "A = [[-3.0]]\nB = [[3.0]]\nC = [[1.0]]"),
+    "ode": ("u", "V", "y", "V", 'rate = 3.0\nstates = { y = "V" }\nequations = { y = "rate * (u - y)" }'),
+}
+
+
+@pytest.mark.parametrize("kind", TWINS)
+@pytest.mark.parametrize("is_in_ms", [True, False])
+def test_a_time_in_ms_under_a_bare_name_is_noticed(tmp_path: Path, kind: str, is_in_ms: bool) -> None:
+    drive, drive_unit, answer, unit, parameters = TWINS[kind]
+    t_s = np.arange(600) * 0.01
+    scale = 1e3 if is_in_ms else 1.0
+    np.savez(tmp_path / "data.npz", t=scale * t_s, u=np.sin(3 * t_s), y=np.cos(3 * t_s))
+    (tmp_path / "recording.toml").write_text(
+        f'format = 1\ndata = "data.npz"\ntime_column = "t"\n[twin]\nkind = "{kind}"\n[twin.parameters]\n{parameters}\n'
+        f'[[channels]]\ncolumn = "u"\nrole = "input"\nsignal = "{drive}"\nunit = "{drive_unit}"\n'
+        f'[[channels]]\ncolumn = "y"\nrole = "output"\nsignal = "{answer}"\nunit = "{unit}"\n'
+    )
+    notes = [note for note in load(tmp_path).warnings if "if the column is in ms" in note.lower()]
+    assert len(notes) == is_in_ms
+    assert all("rate_hz = 100 in place of time_column" in note for note in notes)
+
+
+def test_a_time_column_that_names_its_unit_is_converted(tmp_path: Path) -> None:
+    t_s = np.arange(600) * 0.01
+    np.savez(tmp_path / "data.npz", t_ms=1e3 * t_s, u=np.sin(3 * t_s), z=np.cos(3 * t_s))
+    (tmp_path / "recording.toml").write_text(TEXT.replace('"t_s"', '"t_ms"') + stack_channels("u", "z"))
+    found = load(tmp_path)
+    assert found.dt == pytest.approx(0.01)
+    assert "time column 't_ms' is in ms: converted to s" in found.warnings
+
+
+def test_a_key_beside_the_parameters_is_not_ignored_without_a_word(tmp_path: Path) -> None:
+    write(tmp_path, np.arange(1000) * 0.01)
+    text = (tmp_path / "recording.toml").read_text()
+    (tmp_path / "recording.toml").write_text(text.replace("[[channels]]", "gain_um_per_V = 2.0\n[[channels]]", 1))
+    assert any(note.startswith("[twin] gain_um_per_V is not read there") for note in load(tmp_path).warnings)

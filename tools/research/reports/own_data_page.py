@@ -66,12 +66,14 @@ micron mismatch simulate twin.py . --out simulated.csv
 {written}```
 
 The command reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
-{endings}. It prints what it could not know and
-writes it into the file as a comment. `--twin KIND` names the twin, `--rate HZ` the rate of a file without time stamps.
+{endings}.
+It prints what it could not know and writes it into the file as a comment. `--twin KIND` names the twin. A column `t`
+without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no column is a time. `t_ms` is read as ms.
 
-Where time steps are uneven or values are missing, the command names the line and writes nothing. `--cut` resamples the
-columns to even steps at their usual rate and cuts them at gaps; `--resample HZ` uses another rate. `recording.npz` then
-holds the runs one after another, `segments` names the sample at which each begins, and one diagnosis covers all runs.
+Where time steps are uneven or values are missing, the command names the line and writes nothing. Repeat it with `--cut`:
+it resamples the columns to even steps at their usual rate and cuts them at gaps (`--resample HZ`: at another rate).
+`recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the sample at which each
+begins, and one diagnosis covers all runs.
 
 Write the parameters that you believe before you ask what is missing:
 
@@ -83,13 +85,13 @@ hold = "zero"
 noise_rms = 0.02
 ```
 
-`hold = "zero"` says that a computer held the force over each sample. Without it the report names friction here, and the
-verdict is `unexplained`. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
-One `hold` counts for all inputs: beside a held command a measured one looks half a sample late, and a small part of
-an effect may go to a more general one.
+`hold = "zero"` says that a computer held the force over each sample. Without it the verdict here is `unexplained`,
+although friction is named. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know
+it. One `hold` counts for all inputs. A measured input beside a held command then looks half a sample late, and that
+delay can make the engine take an effect for a more general one (a lag for rate-dependent hysteresis).
 
-Your own equations are text, or a Python function that is traced once ([a twin of your own](adding/twin.md)). An output
-with the name of a state is converted to its unit, and forces are tried at every state:
+Your own equations are text, or a Python function ([a twin of your own](adding/twin.md)). An output that has the name of
+a state is converted to the state's unit. The engine tries missing forces at every state:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
@@ -105,13 +107,16 @@ speed = "(torque_per_A * current - bearing * speed) / inertia"
 torque_per_A = 0.045
 bearing = 8e-4
 inertia = 1.8e-3
-fixed = ["inertia"]      # it scales the others: only ratios show in the data
+fixed = ["inertia"]      # the data show only ratios of the three, so one must be known
 hold = "zero"
 ```
 
-Name the commanded value as input where there is one. An input that was measured has noise, and an effect that smooths
-it (a lag, a resonance) then predicts better although the machine has none: state its `noise_rms`, too. The tool then
-uses what is expected of the input given its whole course, and counts what is left of its noise as noise of the output.
+The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stand there or, as here, in `[twin]`:
+`[twin.states]` and `[twin.parameters.states]` are the same; so are the `states` of a `state_space`.
+
+Name the commanded value as input where there is one. A measured input has noise. An effect that smooths this noise (a
+lag, a resonance) then predicts better, although the machine has no such effect. State the input's `noise_rms`, and the
+engine uses the input's expected course and counts the rest of its noise as noise of the output.
 
 ## 2. Diagnose, correct, run again
 
@@ -141,12 +146,12 @@ heavier = simulate({"force": data["force_N"]}, parameters={"mass": 3.0})["positi
 ```
 
 Its parameter `start` is the state at the first sample of this recording; set it for another recording. An FMU takes its
-inputs at the end of a communication step: set before each step the values at its end.
+inputs at the end of a communication step, so set the values at its end before each step.
 
 ## 3. Does it hold on the next recording?
 
-Put `file = "twin.toml"` in place of the `[twin]` table of another recording and diagnose that. An effect that is still
-missing was not excited by the first recording.
+In another recording, put `file = "twin.toml"` in place of everything in its `[twin]` table, and diagnose that
+recording. If an effect is missing there, the first recording did not excite it.
 """
 
 
