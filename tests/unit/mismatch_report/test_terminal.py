@@ -63,10 +63,36 @@ def test_agrees_lists_every_detection_limit():
 
 def test_unexplained_keeps_what_was_explained_before():
     text = printed(replace(unexplained(), physics=(creep(),)))
-    assert "What was explained before" in text
+    assert "What explains a part of it" in text
     assert "[mechanics]" in text
     assert "[actuator]" in text
     assert "the same path of command at three speeds" in text
+
+
+def test_a_linear_effect_beside_columns_that_leaves_only_noise_is_not_called_a_rest():
+    """Only a wrong parameter of the simulation behind the columns is a rival: the report says that, and no more."""
+    summary = (
+        "What creep explains of displacement may also be a wrong parameter of the simulation that made the columns."
+    )
+    explained = replace(
+        missing_physics(), verdict="unexplained", meaning="place_not_reachable", twin="columns", summary=summary
+    )
+    text = " ".join(printed(explained).split())
+    assert "account for all of it down to the noise" in text
+    assert "What would explain it" in text
+    assert "is left" not in text
+    rest = replace(explained, fit=replace(explained.fit, fitted_rms=explained.fit.recalibrated_rms))
+    text = " ".join(printed(rest).split())
+    assert "what is left may sit between them" in text
+    assert "What explains a part of it" in text
+
+
+def test_a_probability_that_two_names_share_names_the_other():
+    found = missing_physics()
+    halved = replace(found, physics=(replace(creep(), confidence=0.51),))
+    assert "sure 51 %, a probability shared with ac coupling, which fits as well" in printed(halved)
+    assert "shared" not in printed(found), "at 97 % the other has no share that matters"
+    assert "shared" not in printed(replace(halved, equivalent=()))
 
 
 @pytest.mark.parametrize("width", [60, 80, 200])

@@ -60,6 +60,7 @@ def html_page(report: Report) -> str:
         scaled=wording.scaled,
         why_withheld=wording.why_withheld,
         meaning=wording.meaning(report),
+        physics_title=wording.physics_title(report),
         hold=wording.hold(report),
     )
 
@@ -101,7 +102,7 @@ def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
         "before": number(p.residual_rms_before * factor),
         "after": number(p.residual_rms_after * factor),
         "unit": unit,
-        "confidence": percent(p.confidence),
+        "sure": wording.sure(report, p),
         "plain": plain(p.equation),
     }
 

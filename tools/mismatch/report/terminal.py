@@ -57,17 +57,17 @@ def _where(report: Report) -> RenderableType:
     return t
 
 
-def _physics(k: int, p: PhysicsFound, fit: FitSummary) -> RenderableType:
+def _physics(k: int, p: PhysicsFound, report: Report) -> RenderableType:
     head = Text.assemble(
         (f"{k}. {words(p.name)}", "bold yellow"),
-        f" of {', '.join(p.outputs)}, at the {p.stage}; sure {percent(p.confidence)}",
+        f" of {', '.join(p.outputs)}, at the {p.stage}; {wording.sure(report, p)}",
     )
     t = _table("parameter", "value", "95 % interval", "unit")
     t.columns[3].justify = "left"
     for name, v in p.parameters.items():
         value, lo, hi = wording.interval(v)
         t.add_row(Text(wording.label(name, v.unit)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
-    rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, fit)), ("source", p.source)]
+    rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, report.fit)), ("source", p.source)]
     if p.note:
         rows.append(("place", f"{p.note}: this recording cannot tell"))
     if p.at_bound:
@@ -159,8 +159,8 @@ def render(report: Report) -> RenderableType:
     if report.location.outputs:
         parts.append(_section("Where", _where(report)))
     if report.physics:
-        title = "What is missing" if report.verdict == "missing_physics" else "What was explained before"
-        parts.append(_section(title, Group(*(_physics(i + 1, p, report.fit) for i, p in enumerate(report.physics)))))
+        named = Group(*(_physics(i + 1, p, report) for i, p in enumerate(report.physics)))
+        parts.append(_section(wording.physics_title(report), named))
     parts.append(_section("Residual on data that no fit has seen (rms)", _fit(report)))
     if report.together is not None:
         title = f"Between {len(report.together.recordings)} recordings (each left out once, or in groups)"

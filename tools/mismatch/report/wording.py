@@ -35,6 +35,13 @@ MEANINGS: Mapping[str, str] = {
     " of the vocabulary does this",
 }
 """Meanings of the verdict ``unexplained``, with the advice for each."""
+IMITATED = (
+    "the effects below account for all of it down to the noise. The parameters of the simulation behind these columns"
+    " cannot be re-fitted, and a wrong one can look the same: a twin with its equations (ode) tells the two apart"
+)
+"""Meaning of ``place_not_reachable`` where the named effects leave nothing."""
+UNSURE = 0.75
+"""Probability of a name below which an equally good rival is named beside it."""
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
 MUCH = 1.5  # ratio of residual to noise floor above which every report mentions the rest
 SHOWABLE = 1.05  # ratio of residual to noise floor below which nothing is left to be explained
@@ -222,9 +229,34 @@ def hold(report: Report) -> str:
 
 
 def meaning(report: Report) -> str:
-    """Return the meaning of ``unexplained`` on this recording as one sentence; "" for the other verdicts."""
-    text = MEANINGS.get(report.meaning, "")
+    """Return the meaning of ``unexplained`` on this recording; "" for the other verdicts."""
+    text = IMITATED if leaves_nothing(report) else MEANINGS.get(report.meaning, "")
     return f"{text}: {'; '.join(report.trouble)}" if report.trouble and text else text
+
+
+def leaves_nothing(report: Report) -> bool:
+    """Return True if a report is ``unexplained`` although its effects leave only noise: the place alone is in doubt."""
+    f = report.fit
+    ends = {o: max(v, f.noise_floor_interval.get(o, (v, v))[1]) for o, v in f.noise_floor_rms.items()}
+    within = all(f.fitted_rms[o] <= max(MUCH * end, f.tolerance.get(o, 0.0)) for o, end in ends.items())
+    return report.meaning == "place_not_reachable" and bool(report.physics) and within
+
+
+def physics_title(report: Report) -> str:
+    """Return the heading of the named effects."""
+    if report.verdict == "missing_physics":
+        return "What is missing"
+    return "What would explain it" if leaves_nothing(report) else "What explains a part of it"
+
+
+def sure(report: Report, p: PhysicsFound) -> str:
+    """Return how sure a name is, and the names with which it shares the probability because they fit as well."""
+    text = f"sure {percent(p.confidence)}"
+    rivals = [words(n) for e in report.equivalent if p.name in e.names for n in e.names if n != p.name]
+    if not rivals or p.confidence >= UNSURE:
+        return text
+    fit = "fits" if len(rivals) == 1 else "fit"
+    return f"{text}, a probability shared with {', '.join(dict.fromkeys(rivals))}, which {fit} as well"
 
 
 def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:

@@ -71,7 +71,7 @@ It prints what it could not know and writes it into the file as a comment. `--tw
 without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no column is a time. `t_ms` is read as ms.
 
 Where time steps are uneven or values are missing, the command names the line and writes nothing. Repeat it with
-`--cut`: it resamples the columns to even steps at their usual rate and cuts them at gaps (`--resample HZ`: another rate).
+`--cut`: it resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
 `recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the sample at which each
 begins, and one diagnosis covers all runs.
 
