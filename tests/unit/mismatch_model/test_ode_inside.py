@@ -1,0 +1,207 @@
+"""Forces and flows inside a twin of equations: friction, weight, springs, leaks of a storage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_model.ode_systems import CHANNELS, PENDULUM, RATE_HZ, command, pendulum, recorded
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_flows import flow_starts
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.make import make
+
+
+def test_dry_friction_brings_a_body_to_rest_and_keeps_it_there(tmp_path: Path) -> None:
+    """Closed form: deceleration mu from v0 stops after v0 / mu, v0^2 / (2 mu) further on."""
+    twin = """
+[twin]
+kind = "ode"
+[twin.states]
+angle = "rad"
+speed = { unit = "rad/s", start = 3.0 }
+[twin.equations]
+angle = "speed"
+speed = "command"
+"""
+    t = np.arange(400) / RATE_HZ
+    mu = 2.0
+    y = np.where(t < 1.5, 3 * t - mu * t * t / 2, 2.25)
+    push = np.where((t > 2.0) & (t < 3.0), 1.9, 0.0)
+    recording = recorded(tmp_path, twin, push, y)
+    twin_ = make(recording)
+    place = sites(twin_, recording, EFFECTS["coulomb_friction"])[0]
+    assert (place.site, place.target) == ("feedback", "speed")
+    model = Model(twin_, [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = mu, 0.0, 0.0
+    residual = model.residual(View.whole(recording), theta)["angle"]
+    assert np.max(np.abs(residual)) < 1e-4
+    assert np.ptp(model.simulate(View.whole(recording), theta)["angle"][160:]) == 0.0
+
+
+def test_forces_of_an_axis_and_of_equations_are_the_same(tmp_path: Path) -> None:
+    """One declaration of each effect serves both; two integrators meet within their own step errors."""
+    u = 3.0 * command(500)
+    axis = """
+[twin]
+kind = "mechanical_axis"
+[twin.parameters]
+mass = 1.0
+damping = 0.4
+stiffness = 30.0
+"""
+    equations = """
+[twin]
+kind = "ode"
+[twin.states]
+position = "rad"
+velocity = "rad/s"
+[twin.equations]
+position = "velocity"
+velocity = "torque - c * velocity - k * position"
+[twin.parameters]
+c = 0.4
+k = 30.0
+"""
+    channels = CHANNELS.replace('"command"', '"torque"').replace('"angle"', '"position"').replace('"V"', '"N m"')
+    one = recorded(tmp_path / "equations", equations, u, 0.1 * u[::-1], channels)
+    for name, weights, searched in (
+        ("cubic_stiffness", (400.0, 3.0), ()),
+        ("cubic_stiffness", (400.0, 3.0, 60.0), ()),
+        ("gravity_load", (-40.0, 9.0), ()),
+        ("coulomb_friction", (0.6, 0.1, 0.05), ()),
+        ("quadratic_drag", (6.0,), ()),
+        ("amplitude_dependent_damping", (300.0,), ()),
+        ("clearance", (200.0,), (0.02, 0.01)),
+        ("hysteresis", (1.0,), (0.05,)),
+    ):
+        moved = []
+        for recording in (one, None):
+            recording = recording or recorded(tmp_path / name, axis, u, moved[0], channels)
+            every = sites(make(recording), recording, EFFECTS[name])
+            forces = [p for p in every if p.site == "feedback"]
+            place = next(p for p in reversed(forces) if len(p.effect.parts({}).weights) == len(weights))
+            model = Model(make(recording), [place])
+            theta = model.start(recording)
+            a, b = model.slices(0)
+            theta[a], theta[b] = searched, weights
+            moved.append(model.simulate(View.whole(recording), theta)["position"])
+        plain = Model(make(one)).simulate(View.whole(one), np.array([0.4, 30.0]))
+        assert np.std(moved[0] - plain["position"]) > 0.1 * np.std(moved[0]), name
+        assert np.std(moved[0] - moved[1]) < 0.02 * np.std(moved[0]), name
+
+
+def test_a_weight_on_a_lever_is_a_force_at_an_angle_alone(tmp_path: Path) -> None:
+    recording, exact = pendulum(tmp_path / "angle")
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    place = replace(place, settings={"travel": (float(np.ptp(exact)),)})
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = -160.0 * math.cos(0.3), 160.0 * math.sin(0.3)
+    assert np.max(np.abs(model.residual(View.whole(recording), theta)["angle"])) < 1e-3
+    found = {h.name: h.value for h in model.human(theta)[place.label]}
+    assert found["largest_load"] == pytest.approx(160.0 * 0.09 / 20.0)  # in volts of the command
+    assert found["angle_at_rest"] == pytest.approx(0.3)
+    metres = PENDULUM.replace('"rad"', '"m"').replace('"rad/s"', '"m/s"')
+    line = recorded(tmp_path / "line", metres, recording.inputs["command"], exact, CHANNELS.replace('"rad"', '"m"'))
+    assert sites(make(line), line, EFFECTS["gravity_load"]) == []
+
+
+def test_flows_of_two_tanks_are_those_of_the_source(tmp_path: Path) -> None:
+    """Root outflow of the upper tank into the lower, and overflow, against an adaptive solver."""
+    twin = """
+[twin]
+kind = "ode"
+[twin.states]
+upper = { unit = "m", start = 0.5, min = 0.0 }
+level = { unit = "m", start = 0.4, min = 0.0 }
+[twin.equations]
+upper = "pump * command - a * upper"
+level = "a * upper - b * level"
+[twin.parameters]
+pump = 1.0
+a = 0.1
+b = 0.1
+"""
+    channels = CHANNELS.replace('"angle"', '"level"').replace('"rad"', '"m"')
+    u = 1.1 + 0.4 * command()
+    t = np.arange(u.size) / RATE_HZ
+
+    def slopes(now: float, h: np.ndarray) -> list[float]:
+        top, low = np.sqrt(max(h[0], 0.0)), np.sqrt(max(h[1], 0.0))
+        over = max(h[0] - 0.9, 0.0)
+        inside = np.interp(now, t, u) - 0.1 * h[0] - 0.8 * top - 3.0 * over
+        return [inside, 0.1 * h[0] - 0.1 * h[1] + 0.8 * top - 0.7 * low + 1.2 * over]
+
+    exact = solve_ivp(slopes, (0, t[-1]), [0.5, 0.4], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.5 / RATE_HZ).y
+    assert exact[0].max() > 1.0
+    recording = recorded(tmp_path, twin, u, exact[1], channels)
+    tanks = make(recording)
+    root = next(p for p in sites(tanks, recording, EFFECTS["square_root_outflow"]) if p.target == "upper+level")
+    over = next(p for p in sites(tanks, recording, EFFECTS["overflow"]) if p.target == "upper")
+    pairs = {p.name: p.pairs for p in tanks.places}  # type: ignore[attr-defined]
+    assert pairs["upper+level"] == (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    settings = {"range": (0.0, 1.0), "rate": (1.0,)}
+    root = replace(root, settings={**settings, "pairs": pairs["upper+level"]})
+    over = replace(over, settings={**settings, "pairs": pairs["upper"]})
+    model = Model(tanks, [root, over])
+    theta = model.start(recording)
+    for k, values in enumerate([(0.0, 0.0, 0.8, 0.8, 0.7), (0.9, 3.0, 1.2)]):
+        a, b = model.slices(k)
+        theta[a.start : b.stop] = values
+    residual = model.residual(View.whole(recording), theta)["level"]
+    assert np.max(np.abs(residual)) < 2e-5
+
+
+LINEAR_TANKS = """
+[twin]
+kind = "ode"
+[twin.states]
+upper = { unit = "m", start = 1.0 }
+level = { unit = "m", start = 1.0 }
+[twin.equations]
+upper = "gain * command - a * upper - deficit"
+level = "a * upper - b * level + surplus"
+[twin.parameters]
+gain = 20.0
+a = 7.0
+b = 7.0
+deficit = 7.0
+surplus = 0.0
+"""
+
+
+def test_flows_begin_in_place_of_the_linear_terms_that_are_their_tangents(tmp_path: Path) -> None:
+    channels = CHANNELS.replace('"angle"', '"level"').replace('"rad"', '"m"')
+    u = 0.7 + 0.5 * command()
+    t = np.arange(u.size) / RATE_HZ
+
+    def slopes(now: float, h: np.ndarray) -> list[float]:
+        top, low = np.sqrt(max(h[0], 0.0)), np.sqrt(max(h[1], 0.0))
+        return [20 * np.interp(now, t, u) - 14 * top, 14 * top - 14 * low]
+
+    exact = solve_ivp(slopes, (0, t[-1]), [1.0, 1.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.5 / RATE_HZ).y
+    recording = recorded(tmp_path, LINEAR_TANKS, u, exact[1], channels)
+    tanks = make(recording)
+    view = View.whole(recording)
+    linear = Model(tanks)
+    given = linear.start(recording)
+    root = next(p for p in sites(tanks, recording, EFFECTS["square_root_outflow"]) if p.target == "upper+level")
+    root = prepare(linear, view, given, root)
+    model = Model(tanks, [root])
+    theta = model.carry(linear, given, recording)
+    theta[model.slices(0)[0]] = 0.0
+    start = flow_starts(model, 0, view, theta, "level")[0]
+    assert np.all(start[model.slices(0)[1]] > 8.0)  # the roots carry the flow,
+    assert np.all(np.abs(start[[1, 2]]) < 3.0)  # and the linear terms do not
+    before = float(np.std(linear.residual(view, given)["level"]))
+    assert float(np.std(model.residual(view, start)["level"])) < 0.5 * before

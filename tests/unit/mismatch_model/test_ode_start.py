@@ -1,0 +1,75 @@
+"""Start states of a twin of equations: set by the first samples, and again where a stretch starts afresh."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_model.ode_systems import MOTOR, RATE_HZ, command, pendulum, recorded
+from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.make import make
+
+
+def test_a_start_that_nobody_knows_is_set_by_the_first_samples(tmp_path: Path) -> None:
+    u = command()
+    t = np.arange(u.size) / RATE_HZ
+    exact = solve_ivp(
+        lambda now, x: [x[1], (20 * np.interp(now, t, u) - x[1]) / 0.08], (0, t[-1]), [5.0, -12.0],
+        t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.5 / RATE_HZ,
+    ).y[0]  # fmt: skip
+    recording = recorded(tmp_path, MOTOR, u, exact)
+    model = Model(make(recording))
+    view = View(recording, ((0, 200), (300, 600)), 40)
+    assert np.max(np.abs(model.residual(view, model.start(recording))["angle"])) < 1e-3
+    assert model.twin.restart
+
+
+def test_a_stretch_begins_where_it_was_read_and_not_where_a_drifted_run_has_come_to(tmp_path: Path) -> None:
+    """Without the weight the twin is turns away by then, and the sine has the wrong phase there."""
+    recording, _ = pendulum(tmp_path)
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    plain = Model(make(recording)).simulate(View.whole(recording), theta[:1])["angle"]
+    assert np.max(np.abs(plain - recording.outputs["angle"])) > math.pi
+    theta[model.slices(0)[1]] = -160.0 * math.cos(0.3), 160.0 * math.sin(0.3)
+    view = View(recording, ((40, 262), (501, 700), (760, 900)), 40, afresh=True)
+    assert np.max(np.abs(model.residual(view, theta)["angle"])) < 0.02
+
+
+def noisy_motor(folder: Path) -> tuple[Recording, np.ndarray]:
+    """A recording of the motor with sensor noise of 10 mrad, and the angle without it (600,)."""
+    u = command()
+    plain = recorded(folder / "plain", MOTOR, u, 2.0 * u)
+    twin = make(plain)
+    true = Model(twin).simulate(View.whole(plain), twin.start(plain))["angle"]
+    noise = 0.01 * np.random.default_rng(7).standard_normal(u.size)
+    return recorded(folder / "noisy", MOTOR, u, true + noise), true
+
+
+def test_a_stretch_that_starts_afresh_is_met_by_all_its_samples_and_by_no_other(tmp_path: Path) -> None:
+    recording, true = noisy_motor(tmp_path)
+    twin = make(recording)
+    theta, ranges = twin.start(recording), ((0, 200), (220, 600))
+    inside = np.r_[40:200, 260:600]
+
+    def left(recording: Recording, afresh: bool) -> float:
+        view = View(recording, ranges, 40, afresh=afresh)
+        whole = Model(twin).whole(view, theta)["angle"]
+        return float(np.sqrt(np.mean((whole - true)[inside] ** 2)))
+
+    # two numbers from 200 and 380 samples of 10 mrad: 0.01 * sqrt(4 / 580) = 0.8 mrad; speed and angle from 40 more
+    assert left(recording, True) < 1.3e-3 < left(recording, False)
+    gap = recording.outputs["angle"].copy()
+    gap[200:220] += 5.0
+    beside = replace(recording, outputs={"angle": gap})
+    assert left(beside, True) == pytest.approx(left(recording, True), rel=1e-6)
