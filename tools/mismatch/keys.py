@@ -67,10 +67,13 @@ TWIN = (
 HOLD = Key(
     "hold",
     "linear, zero, smooth",
-    "between samples the input runs straight, is held, or has nothing above half the rate",
+    "between samples the input runs straight, is held, or has nothing above half the rate; or a table by input",
     "inferred, else linear",
 )
-HOLD_OR_STRAIGHT = Key("hold", "linear, zero", "between samples the input runs straight or is held", HOLD.default)
+HOLD_OF_EACH = Key(
+    "hold", "linear, zero", "between samples the inputs run straight or are held; or a table by input", HOLD.default
+)
+HOLD_OR_STRAIGHT = Key("hold", "linear, zero", "between samples the inputs run straight or are held", HOLD.default)
 _PER_OUTPUT = "number, list or table by output"
 _AXES = "number, list or table by output (x, y, z)"
 
@@ -142,7 +145,7 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
                 "none",
             ),
             Key("fixed", "list of names", "parameters that are not re-fitted", "none"),
-            HOLD_OR_STRAIGHT,
+            HOLD_OF_EACH,
             Key("any other name", "number", "a parameter of the equations; may be re-fitted"),
         ),
         "fmu": (

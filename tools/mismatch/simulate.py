@@ -18,7 +18,7 @@ from sim_devices.physics.effect import STAGES, Array, Context, Human, Settings
 from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
-from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
+from tools.mismatch.twins.base import Force, Path, Run, Signal, Twin, fold
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.memo import remember
@@ -319,26 +319,42 @@ class Model:
     ) -> tuple[dict[str, Signal], dict[str, Signal]]:
         """Return the outputs behind their effects, and in front of them."""
         how = replace(how, theta=np.asarray(how.theta, np.float64))
-        theta, folded = how.theta, how.folded
+        folded = how.folded
         inputs, forces = self._driven(run, how, given)
         if folded is not None and forces:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
         every = [*forces, *beside]
-        run = replace(run, bent=self.bends)
-        outputs = self.twin.respond(run, inputs, theta, every, how.join)
+        outputs, run = self._started(run, inputs, how, every)
         if only is not None:
             outputs = {o: s for o, s in outputs.items() if o in only}
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
-        found, behind = self._behind(run, inputs, outputs, how)
-        recorded = run
-        for _ in range(START_PASSES if run.window and behind else 0):
+        return self._behind(run, inputs, outputs, how)[0], outputs
+
+    def _started(
+        self, run: Run, inputs: Mapping[str, Signal], how: Pass, forces: Sequence[Force]
+    ) -> tuple[dict[str, Signal], Run]:
+        """Return the outputs in front of their effects, and the run with what its start states are read off.
+
+        Effects at an output show a start state late or bent. Linear ones are part of the twin's own equations for it;
+        the others are taken off the measured outputs, pass by pass.
+        """
+        inside = inside_of(self.twin)
+        paths = self._paths(run, how.theta)
+        run = replace(run, bent=self.bends, paths=paths)
+        outputs = self.twin.respond(run, inputs, how.theta, forces, how.join)
+        if not run.window:
+            return outputs, run
+        if paths and (inside is not None or forces) and len(run.starts) > 1:
+            run = replace(run, about={o: outputs[o].value for o in paths}, memo=_without_runs(run))
+            return self.twin.respond(run, inputs, how.theta, forces, how.join), run
+        recorded, behind = run, self._behind(run, inputs, outputs, how)[1]
+        for _ in range(START_PASSES if behind else 0):
             run = before_effects(recorded, behind)
-            outputs = self.twin.respond(run, inputs, theta, every, how.join)
-            outputs = {o: outputs[o] for o in found}
-            found, behind = self._behind(run, inputs, outputs, how)
-        return found, outputs
+            outputs = self.twin.respond(run, inputs, how.theta, forces, how.join)
+            behind = self._behind(run, inputs, outputs, how)[1]
+        return outputs, run
 
     def _behind(
         self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], how: Pass
@@ -362,7 +378,7 @@ class Model:
                 now = self._pass(run, k, was, by, o, how)
                 # with weights the outputs of a linear twin would be affine in them no more
                 afresh = inside.integrates if inside is not None else self.twin.restart and not pl.parts.weights
-                if afresh and pl.effect.driven:
+                if afresh and pl.effect.driven and o not in run.paths:
                     # the start states depend on it
                     if how.folded is not None:
                         how.folded.update(now.columns)
@@ -370,6 +386,29 @@ class Model:
                     change[o] = change.get(o, 0.0) + now.value - fold(was, how.theta).value
                 found[o] = now
         return found, change
+
+    def _paths(self, run: Run, theta: Array) -> dict[str, Path]:
+        """Return the paths of the outputs behind which only linear effects are driven."""
+        found: dict[str, Path] = {}
+        if not isinstance(self.twin, DynamicTwin | CascadeTwin) and inside_of(self.twin) is None:
+            return found
+        for o in self.twin.outputs:
+            behind = [k for k in self.order if self.placed[k].site == "output" and o in self.placed[k].outputs]
+            behind = [k for k in behind if self.placed[k].effect.driven]
+            if behind and all(self.placed[k].effect.kind == "linear" for k in behind):
+                found[o] = self._path(run, behind, o, theta)
+        return found
+
+    def _path(self, run: Run, behind: Sequence[int], output: str, theta: Array) -> Path:
+        how = Pass(theta, True)
+
+        def carry(x: Array) -> Array:
+            for k in behind:
+                x = self._pass(run, k, Signal(x), None, output, how).value
+            return x
+
+        places = ((self.placed[k], theta[self._slices[k][0]]) for k in behind)
+        return Path(carry, tuple((p.effect.form, q.tobytes(), _frozen(p.settings)) for p, q in places))
 
     def _driven(
         self, run: Run, how: Pass, given: Mapping[str, Signal] | None = None
@@ -392,13 +431,7 @@ class Model:
         how = Pass(theta, True)
         inputs, forces = self._driven(run, how)
         used = {s: fold(x, theta) for s, x in inputs.items()}
-        recorded = run
-        for _ in range(START_PASSES if run.window else 0):
-            outputs = self.twin.respond(run, inputs, theta, forces, True)
-            behind = self._behind(run, inputs, outputs, how)[1]
-            if not behind:
-                break
-            run = before_effects(recorded, behind)
+        _, run = self._started(run, inputs, how, forces)
         return inside.states(run, used, theta, forces)[0][0]
 
     def force(self, k: int, theta: Array) -> Force:
@@ -467,7 +500,12 @@ def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:
     Start states are read off these outputs.
     """
     before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
-    return replace(run, measured=before, memo={k: v for k, v in run.memo.items() if k == ("about", run.starts)})
+    return replace(run, measured=before, memo=_without_runs(run))
+
+
+def _without_runs(run: Run) -> dict[object, object]:
+    """Return the cache of a run without what depends on its measured outputs."""
+    return {k: v for k, v in run.memo.items() if k == ("about", run.starts)}
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from scipy.signal import dlsim, dlti
 
-from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.exponential import exponential
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
-from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, with_hold
+from tools.errors import RecordingError
+from tools.mismatch.engine.hold import infer_holds, undeclared, with_hold
 from tools.mismatch.engine.one_way import direction, one_way
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.report import BaseShift
-from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.vary import added
 from tools.mismatch.recording import Recording
 from tools.mismatch.report import wording
 from tools.mismatch.twins.linear import between_samples
@@ -45,8 +43,8 @@ def axis(seed: int, *, zero: bool, late: float = 0.0) -> Recording:
 @pytest.mark.parametrize("seed", range(2))
 def test_the_hold_of_an_input_is_read_off_the_data(seed: int, zero: bool) -> None:
     problem, _, base = prepared(axis(seed, zero=zero), 0.3, 0, False)
-    assert holdable(problem)
-    found = infer_hold(problem, base)
+    assert undeclared(problem) == ("force",)
+    found = infer_holds(problem, base)["force"]
     assert (found.kind, found.how) == ("zero" if zero else "linear", "inferred")
     assert found.share == pytest.approx(1.0 if zero else 0.0, abs=0.2)
 
@@ -68,9 +66,9 @@ def test_an_input_without_content_above_half_the_rate_is_smooth() -> None:
     noisy = position + rng.normal(0, 1e-3 * np.std(position), position.size)
     rec = recording("mechanical_axis", {"force": force[keep]}, {"position": noisy[keep]}, believed)
     problem, _, base = prepared(rec, 0.3, 0, False)
-    found = infer_hold(problem, base)
+    found = infer_holds(problem, base)["force"]
     assert (found.kind, found.how) == ("smooth", "inferred")
-    better = prepared(with_hold(rec, "smooth"), 0.3, 0, False)[2]
+    better = prepared(with_hold(rec, {"force": "smooth"}), 0.3, 0, False)[2]
     assert np.std(better.residual["position"]) < 0.9 * np.std(base.residual["position"])
 
 
@@ -85,25 +83,52 @@ def test_a_smooth_input_meets_sinusoids_between_its_samples() -> None:
 
 def test_a_true_delay_of_three_samples_is_no_hold() -> None:
     problem, _, base = prepared(axis(3, zero=False, late=3.0), 0.3, 0, False)
-    assert infer_hold(problem, base).kind == "linear"
+    assert infer_holds(problem, base)["force"].kind == "linear"
 
 
 def test_a_declared_hold_is_not_questioned() -> None:
-    problem, _, _ = prepared(with_hold(axis(4, zero=True), "zero"), 0.3, 0, False)
-    assert not holdable(problem)
+    problem, _, base = prepared(with_hold(axis(4, zero=True), {"force": "zero"}), 0.3, 0, False)
+    assert undeclared(problem) == ()
+    assert infer_holds(problem, base)["force"].how == "declared"
     assert problem.twin.to_text(problem.twin.start(problem.recording))["hold"] == "zero"
 
 
-def test_a_named_delay_of_half_a_sample_is_the_hold() -> None:
-    problem, _, base = prepared(axis(5, zero=True), 0.3, 0, False)
-    place = places(problem, [EFFECTS["dead_time"]], ())[0]
-    with np.errstate(all="ignore"):
-        fitted = added(problem, base, place)
-    assert delay_is_hold(problem, fitted)
-    late, _, base = prepared(axis(5, zero=False, late=3.0), 0.3, 0, False)
-    with np.errstate(all="ignore"):
-        fitted = added(late, base, place)
-    assert not delay_is_hold(late, fitted)
+@pytest.mark.parametrize("kind", ["state_space", "ode"])
+def test_each_input_has_a_hold_of_its_own(kind: str) -> None:
+    """A heated body in steps of a fortieth of a sample: its heater is held, the air around it is not."""
+    rng = np.random.default_rng(8)
+    n, sub, rate, loss = 2000, 40, 40.0, 9.0
+    heat, air = (2.0 * wave(rng, n, low=1.0, high=200.0) for _ in range(2))
+    at = (np.arange(n * sub) + 0.5) / sub
+    power, around = heat[np.floor(at).astype(int)], np.interp(at, np.arange(n), air)
+    x, warm = 0.0, np.empty(n)
+    for i in range(n):
+        warm[i] = x
+        for p, a in zip(power[i * sub : (i + 1) * sub], around[i * sub : (i + 1) * sub], strict=True):
+            x += (rate * p - loss * (x - a)) / (RATE * sub)
+    warm += rng.normal(0, 1e-4, n)
+    if kind == "ode":
+        believed: dict[str, object] = {"rate": 38.0, "loss": 9.5, "states": {"x": {"unit": "V"}}}
+        believed |= {"equations": {"x": "rate * heat - loss * (x - air)"}, "outputs": {"warm": "x"}}
+    else:
+        believed = {"A": [[-9.5]], "B": [[38.0, 9.5]], "C": [[1.0]]}
+    rec = recording(kind, {"heat": heat, "air": air}, {"warm": warm}, believed)
+    problem, _, base = prepared(rec, 0.3, 0, False)
+    found = infer_holds(problem, base)
+    assert {s: (h.kind, h.how) for s, h in found.items()} == {
+        "heat": ("zero", "inferred"),
+        "air": ("linear", "inferred"),
+    }
+    right = prepared(with_hold(rec, {"heat": "zero"}), 0.3, 0, False)[2]
+    assert np.std(right.residual["warm"]) == pytest.approx(1e-4, rel=0.1)
+    assert np.std(base.residual["warm"]) > 2e-4
+    problem, _, base = prepared(with_hold(rec, {"air": "linear"}), 0.3, 0, False)
+    assert {s: h.how for s, h in infer_holds(problem, base).items()} == {"heat": "inferred", "air": "declared"}
+
+
+def test_a_hold_of_no_input_is_refused() -> None:
+    with pytest.raises(RecordingError, match=r"hold names 'power', which is no input; inputs: force"):
+        prepared(with_hold(axis(4, zero=True), {"power": "zero"}), 0.3, 0, False)
 
 
 def test_which_way_a_load_moved() -> None:

@@ -33,7 +33,8 @@ def stack(change: np.ndarray, u: np.ndarray) -> Recording:
 
 def test_a_named_delay_of_half_a_sample_is_the_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held inputs through a twin that runs them straight, on data that are made not to tell which of the two it is."""
-    monkeypatch.setattr(preparation, "infer_hold", lambda problem, base: Hold("linear", "assumed"))
+    assumed = {"force": Hold("linear", "assumed")}
+    monkeypatch.setattr(preparation, "infer_holds", lambda problem, base: assumed)
     report = diagnose(axis(5, zero=True), jobs=1, effects=[EFFECTS["dead_time"]])
     assert {h.how for h in report.hold.values()} == {"instead_of_delay"}
     assert not report.physics

@@ -202,7 +202,7 @@ def assemble(
         meaning=decision.meaning,
         trouble=decision.trouble,
         doubtful=decision.doubtful,
-        hold=dict.fromkeys(twin.inputs, posed.hold) if posed.hold is not None else {},
+        hold=posed.holds,
         one_way=one_way(problem, fitted, shifts),
         pictures=Pictures(
             rec.t[problem.index],

@@ -7,21 +7,24 @@ parameters (Frisch and Waugh, Econometrica 1, 1933): a share of 0 is linear, of 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.mismatch.engine.colour import fit_whitener, whiten
-from tools.mismatch.engine.fit import Fit, fit, fit_base
-from tools.mismatch.engine.found import human_values
-from tools.mismatch.engine.intervals import jacobian, uncertainty
+from tools.mismatch.engine.fit import Fit, fit_base
+from tools.mismatch.engine.intervals import jacobian
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.report import Hold
-from tools.mismatch.engine.score import misfits
+from tools.mismatch.engine.report import Hold, HoldHow, HoldKind
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
+from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.holds import declared_holds
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.ode import OdeTwin
 
 NEAR = 0.3
 """Largest distance of the share from 0 or 1 at which it decides for that value."""
@@ -29,105 +32,144 @@ CLEAR = 6.0
 """Least distance of the share from the rejected value, in standard errors."""
 
 
-def declared_hold(recording: Recording) -> str:
-    """Return the hold that the recording declares: "zero", "linear", or "" if none is declared or needed."""
-    p = recording.twin.parameters
-    return str(p["hold"]) if "hold" in p else ""
+def undeclared(problem: Problem) -> tuple[str, ...]:
+    """Return the inputs whose hold the twin's output depends on and the recording does not declare."""
+    holds = getattr(problem.twin, "holds", {})
+    stated = declared_holds(problem.recording)
+    return tuple(s for s, h in holds.items() if h == "linear" and s not in stated)
 
 
-def holdable(problem: Problem) -> bool:
-    """Return True if the twin's output depends on the hold of its inputs."""
-    return getattr(problem.twin, "hold", "") == "linear" and not declared_hold(problem.recording)
+def with_hold(recording: Recording, kinds: Mapping[str, str]) -> Recording:
+    """Return the same recording with inputs of these holds."""
+    holds = {**declared_holds(recording), **kinds}
+    alike = set(holds.values()) if holds.keys() >= recording.inputs.keys() else set[str]()
+    hold = alike.pop() if len(alike) == 1 else holds
+    return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": hold}))
 
 
-def with_hold(recording: Recording, kind: str) -> Recording:
-    """Return the same recording with inputs of this hold."""
-    return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": kind}))
-
-
-def as_held(problem: Problem, kind: str = "zero") -> Problem:
-    """Return the same problem with inputs of this hold."""
-    recording = with_hold(problem.recording, kind)
+def as_held(problem: Problem, kinds: Mapping[str, str]) -> Problem:
+    """Return the same problem with inputs of these holds. Raises RecordingError if the twin cannot have them."""
+    recording = with_hold(problem.recording, kinds)
     twin = make(recording)
     if hasattr(twin, "restart") and twin.restart != problem.twin.restart:
         twin = replace(twin, restart=problem.twin.restart)  # type: ignore[type-var]
     return replace(problem, recording=recording, twin=twin)
 
 
-def infer_hold(problem: Problem, base: Fit) -> Hold:
-    """Return the hold that the data show. ``base``: the twin with its parameters re-fitted, inputs linear.
+@dataclass(frozen=True)
+class Share:
+    """Holds the ``size`` of the difference that another hold makes in the residual, and its standard error."""
 
-    A fit with the wrong hold biases the parameters. If the share is nearer to held, it is estimated once more from
-    parameters that were fitted with held inputs, and that estimate counts.
+    size: float
+    spread: float
+
+    @property
+    def finite(self) -> bool:
+        """Return True if the data have any say."""
+        return bool(np.isfinite(self.size) and np.isfinite(self.spread))
+
+    @property
+    def is_whole(self) -> bool:
+        """Return True if the data support the whole difference and reject none of it."""
+        return self.finite and abs(self.size - 1.0) < NEAR and self.size > CLEAR * self.spread
+
+    @property
+    def is_nothing(self) -> bool:
+        """Return True if the data support none of the difference and reject the whole."""
+        return self.finite and abs(self.size) < NEAR and 1.0 - self.size > CLEAR * self.spread
+
+    def as_hold(self, kind: HoldKind, how: HoldHow) -> Hold:
+        """Return the finding with this share."""
+        return Hold(kind, how, self.size, (self.size - 1.96 * self.spread, self.size + 1.96 * self.spread))
+
+
+def infer_holds(problem: Problem, base: Fit) -> dict[str, Hold]:
+    """Return the hold of each input: as declared, or as the data show. ``base``: the twin re-fitted, inputs linear.
+
+    A fit with the wrong hold biases the parameters. Where a share is nearer to held, all are estimated once more from
+    parameters that were fitted with these inputs held, and those estimates count.
     """
-    other = as_held(problem)
-    share, spread = _share(problem, base, problem, other)
-    if share > 0.5 and share > CLEAR * spread:
-        again = fit_base(other)
-        beyond, spread = _share(other, again, problem, other)
-        share = 1.0 + beyond
-    if not np.isfinite(share) or not np.isfinite(spread):
-        return Hold("linear", "assumed")
-    if abs(share) < abs(share - 1.0):
-        smooth = _smooth(problem, base)
-        if smooth is not None:
-            return smooth
-    ci = (share - 1.96 * spread, share + 1.96 * spread)
-    if abs(share - 1.0) < NEAR and share > CLEAR * spread:
-        return Hold("zero", "inferred", share, ci)
-    if abs(share) < NEAR and 1.0 - share > CLEAR * spread:
-        return Hold("linear", "inferred", share, ci)
-    return Hold("linear", "assumed", share, ci)
+    holds = getattr(problem.twin, "holds", {})
+    stated = declared_holds(problem.recording)
+    found: dict[str, Hold] = {s: Hold(h, "declared") for s, h in holds.items() if s in stated and h != "discrete"}
+    free = undeclared(problem)
+    if not free:
+        return found
+    # a program that is told one hold has one for all
+    groups = [(s,) for s in free] if isinstance(problem.twin, DynamicTwin | OdeTwin) else [free]
+    shares = _shares(problem, base, groups, "zero")
+    held = [g for g, x in zip(groups, shares, strict=True) if x.finite and x.size > max(0.5, CLEAR * x.spread)]
+    straight, at = problem, base
+    if held:
+        straight = as_held(problem, {s: "zero" for g in held for s in g})
+        at = fit_base(straight)
+        shares = _shares(straight, at, groups, "zero")
+        shares = [replace(x, size=1.0 + x.size) if g in held else x for g, x in zip(groups, shares, strict=True)]
+    near = [g for g, x in zip(groups, shares, strict=True) if x.finite and abs(x.size) < abs(x.size - 1.0)]
+    smooth = dict(zip(near, _smooth(straight, at, near), strict=True)) if near else {}
+    for g, x in zip(groups, shares, strict=True):
+        if g in smooth and smooth[g].is_whole:
+            hold = smooth[g].as_hold("smooth", "inferred")
+        elif x.is_whole:
+            hold = x.as_hold("zero", "inferred")
+        else:
+            hold = x.as_hold("linear", "inferred" if x.is_nothing else "assumed")
+            if not x.finite:
+                hold = Hold("linear", "assumed")
+        found |= dict.fromkeys(g, hold)
+    return {s: found[s] for s in holds if s in found}
 
 
-def _smooth(problem: Problem, base: Fit) -> Hold | None:
-    """Return a smooth hold if the data support its full difference to a linear one; else None.
-
-    A twin that cannot have it raises RecordingError, and is not changed.
-    """
+def _smooth(problem: Problem, base: Fit, groups: Sequence[tuple[str, ...]]) -> list[Share]:
+    """Return the share of smooth inputs for each group; none of it for a twin that cannot have them."""
     try:
-        other = as_held(problem, "smooth")
+        return _shares(problem, base, groups, "smooth")
     except RecordingError:
-        return None
-    share, spread = _share(problem, base, problem, other)
-    if not (np.isfinite(share) and np.isfinite(spread)) or not (abs(share - 1.0) < NEAR and share > CLEAR * spread):
-        return None
-    return Hold("smooth", "inferred", share, (share - 1.96 * spread, share + 1.96 * spread))
+        return [Share(np.nan, np.inf)] * len(groups)
 
 
-def _share(problem: Problem, fitted: Fit, linear: Problem, zero: Problem) -> tuple[float, float]:
-    """Estimate the share of the difference between held and linear inputs in the residual of ``fitted``.
+def _shares(problem: Problem, fitted: Fit, groups: Sequence[tuple[str, ...]], kind: str) -> list[Share]:
+    """Estimate the shares in the residual of ``fitted`` of what each group of inputs changes as ``kind``.
 
-    Returns the share and its standard error; (nan, inf) if there is no difference. ``fitted`` belongs to ``problem``.
+    An input that is so already is changed to linear, with the sign turned. A share is nan where there is no difference.
     """
+    now = Model(problem.twin).simulate(problem.view, fitted.theta)
+    changes: list[Mapping[str, Array]] = []
     with np.errstate(all="ignore"):
-        held = Model(zero.twin).simulate(zero.view, fitted.theta)
-        straight = Model(linear.twin).simulate(linear.view, fitted.theta)
+        for g in groups:
+            turned = problem.twin.holds[g[0]] == kind  # type: ignore[attr-defined]
+            other = as_held(problem, dict.fromkeys(g, "linear" if turned else kind))
+            then = Model(other.twin).simulate(other.view, fitted.theta)
+            changes.append({o: (now[o] - then[o]) if turned else (then[o] - now[o]) for o in now})
     rows, spans = problem.fit_rows, problem.fit_spans
     slopes = jacobian(problem, fitted)
-    residual: list[np.ndarray] = []
-    columns: list[np.ndarray] = []
+    residual: list[Array] = []
+    columns: list[Array] = []
     for k, o in enumerate(problem.twin.outputs):
         filters = fit_whitener(fitted.residual[o], stretches=spans)
         usable = [s for s in spans if s[1] - s[0] > filters.warm_up + 4]
-        change = held[o] - straight[o]
+        change = np.stack([c[o] for c in changes])
         if not usable or not np.all(np.isfinite(change)) or not np.any(change):
             continue
         scale = 1.0 / problem.sigma(o)
         full = np.zeros((problem.index.size, slopes.shape[1]))
         full[rows] = slopes[k * rows.size : (k + 1) * rows.size]
-        both = [change * scale, *full.T]
-        columns.append(np.column_stack([whiten(filters, np.ascontiguousarray(c), usable) for c in both]))
+        each = [*(scale * change), *full.T]
+        columns.append(np.column_stack([whiten(filters, np.ascontiguousarray(c), usable) for c in each]))
         residual.append(whiten(filters, fitted.residual[o] * scale, usable))
     if not columns:
-        return np.nan, np.inf
+        return [Share(np.nan, np.inf)] * len(groups)
     x, e = np.concatenate(columns), np.concatenate(residual)
-    size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-    share, spread = _first_coefficient(x / size, e)
-    return share / size[0], spread / size[0]
+    size = np.linalg.norm(x, axis=0)
+    x = x / np.maximum(size, 1e-300)
+    found: list[Share] = []
+    for i in range(len(groups)):
+        one, spread = _first_coefficient(np.column_stack([x[:, i], np.delete(x, i, axis=1)]), e)
+        found.append(Share(one / size[i], spread / size[i]) if size[i] > 0.0 else Share(np.nan, np.inf))
+    return found
 
 
-def _first_coefficient(x: np.ndarray, e: np.ndarray) -> tuple[float, float]:
+def _first_coefficient(x: Array, e: Array) -> tuple[float, float]:
     """Return the least-squares coefficient of the first column of ``x`` (n, k) and its standard error."""
     first, others = x[:, 0], x[:, 1:]
     own = first - others @ np.linalg.lstsq(others, first, rcond=1e-10)[0] if others.shape[1] else first
@@ -140,24 +182,5 @@ def _first_coefficient(x: np.ndarray, e: np.ndarray) -> tuple[float, float]:
     return share, float(np.sqrt(float(left @ left) / max(left.size - x.shape[1], 1) / power))
 
 
-DELAYS = ("dead_time", "channel_delay")
-NO_WORSE = 1.02
-
-
-def delay_is_hold(problem: Problem, fitted: Fit) -> bool:
-    """Return True if the model has a delay of half a sample and held inputs explain the held-out part as well."""
-    half = 0.5 * problem.recording.dt
-    values = human_values(problem, fitted, uncertainty(problem, fitted))
-    for k, placed in enumerate(fitted.model.placed):
-        delay = values.get(placed.label, {}).get("delay_s") if placed.effect.name in DELAYS else None
-        if delay is None or not abs(delay.value - half) < max(delay.ci95[1] - delay.value, 0.2 * half):
-            continue
-        other = as_held(problem)
-        rest = [p for j, p in enumerate(fitted.model.placed) if j != k]
-        model = Model(other.twin, rest)
-        theta = model.carry(fitted.model, fitted.theta, other.recording)
-        again = fit(other, model, [theta], iterations=25)
-        before, after = misfits(problem, fitted), misfits(other, again)
-        if again.ok and all(after[o] <= NO_WORSE * before[o] + 0.02 for o in before):
-            return True
-    return False
+DELAYS = frozenset({"dead_time", "channel_delay"})
+"""Effects that a wrong hold imitates: to first order it is a delay of half a sample."""

@@ -102,13 +102,13 @@ def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
     if min(used.size, judged.size) < 50 * len(KNOTS):
         return None
     pure = Filter((), (), 1.0)
-    given = _filter_of(twin, raw.theta)
-    on = _Trial(u, y, rec.dt, twin.hold, used, judged)
+    given, hold = _filter_of(twin, raw.theta), twin.holds[twin.inputs[0]]
+    on = _Trial(u, y, rec.dt, hold, used, judged)
     ends = [_left(on, *s) for s in ((pure, whole), (whole, pure), (pure, given), (given, pure))]
     found: list[tuple[float, int, tuple[Filter, Filter]]] = []
     # a curve inside bends the poles of a re-fitted twin
     for of in dict.fromkeys((whole, given)):
-        for pair in itertools.islice(_splits(of, twin.hold, rec.dt), MOST_SPLITS):
+        for pair in itertools.islice(_splits(of, hold, rec.dt), MOST_SPLITS):
             found.append((_left(on, *pair), len(found), pair))
     if not found:
         return None
@@ -117,8 +117,8 @@ def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
     if not left < BETTER * min(*ends, plain):
         return None
     keys = ("A", "B", "C", "D")
-    table = dict(zip(keys, (m.tolist() for m in first.matrices(twin.hold)), strict=True))
-    rest = dict(zip(keys, (m.tolist() for m in second.matrices(twin.hold)), strict=True))
+    table = dict(zip(keys, (m.tolist() for m in first.matrices(hold)), strict=True))
+    rest = dict(zip(keys, (m.tolist() for m in second.matrices(hold)), strict=True))
     kept = {k: v for k, v in rec.twin.parameters.items() if k in ("hold", "discrete")}
     offset = {"y0": [[float(base.theta[link.j])] for link in twin.links if link.row == -2]}
     split = replace(rec, twin=replace(rec.twin, parameters={**rest, **offset, **kept, "first": table}))

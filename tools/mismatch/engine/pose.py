@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
-from tools.mismatch.engine.hold import declared_hold, holdable, infer_hold, with_hold
+from tools.mismatch.engine.hold import infer_holds, with_hold
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.many import levelled, repeated_noise
 from tools.mismatch.engine.noise import noise_floor
@@ -163,7 +163,8 @@ class Posed:
     problem: Problem
     raw: Fit
     base: Fit
-    hold: Hold | None
+    holds: Mapping[str, Hold]
+    """Course of each input between its samples; empty for a twin without memory."""
 
 
 def pose(recording: Recording, held_out: float, seed: int, effects: Iterable[Effect] | None, look: Look) -> Posed:
@@ -183,16 +184,12 @@ def pose(recording: Recording, held_out: float, seed: int, effects: Iterable[Eff
     if long:
         catalogue, hints = nominated(recording, held_out, seed, catalogue, look)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
-    hold = None
-    if holdable(problem):
-        hold = infer_hold(problem, base)
-        if hold.kind != "linear":
-            recording = with_hold(recording, hold.kind)
-            problem, raw, base = prepared(recording, held_out, seed, was_joined)
-    elif declared_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
-        declared = declared_hold(recording)
-        hold = Hold("zero" if declared == "zero" else "smooth" if declared == "smooth" else "linear", "declared")
-    return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, hold)
+    holds = infer_holds(problem, base)
+    turned = {s: h.kind for s, h in holds.items() if h.how != "declared" and h.kind != "linear"}
+    if turned:
+        recording = with_hold(recording, turned)
+        problem, raw, base = prepared(recording, held_out, seed, was_joined)
+    return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, holds)
 
 
 @dataclass(frozen=True)
@@ -352,7 +349,7 @@ def nominated(
     names: set[str] = set()
     hints: list[Hint] = []
     parts = [(excerpt(recording, part_of(recording)), catalogue)]
-    if getattr(make(recording), "hold", "") == "discrete":
+    if "discrete" in getattr(make(recording), "holds", {}).values():
         # a difference equation is valid at its own rate only
         names |= set(OVER_ALL)
     else:

@@ -95,17 +95,21 @@ class Withheld:
     replaced_by: str = ""
 
 
+HoldKind = Literal["zero", "linear", "smooth"]
+HoldHow = Literal["declared", "inferred", "assumed", "instead_of_delay"]
+
+
 @dataclass(frozen=True)
 class Hold:
-    """Describes the course of inputs between their samples.
+    """Describes the course of an input between its samples.
 
     ``kind`` is zero (held), linear or smooth (nothing above half the sampling rate); ``how`` is declared, inferred,
     assumed (the data do not determine it) or instead_of_delay (a named delay of half a sample was the hold).
     ``share``: 0 is linear, 1 the tested alternative: held, or smooth where that was inferred.
     """
 
-    kind: Literal["zero", "linear", "smooth"]
-    how: Literal["declared", "inferred", "assumed", "instead_of_delay"]
+    kind: HoldKind
+    how: HoldHow
     share: float | None = None
     ci95: tuple[float, float] | None = None
 

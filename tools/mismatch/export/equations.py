@@ -310,16 +310,19 @@ class EquationLines:
         lines += ["    out = np.empty((len(drive), len(s)))", "    for k, now in enumerate(drive):"]
         again = f"for j in range({self.substeps} if before is not None else 0):"
         lines.append(f"        {'if before is not None:' if self.substeps == 1 else again}")
+        held = [bool(h) for h, s in zip(self.twin.held, self.twin.signals, strict=True) if s in self.signals]
         start = "began" if self.substeps == 1 else "began + j * h"
-        if self.twin.held:
+        if np.all(held):
             body = [f"z = step({start}, s, before, before, before)"]
-        elif self.substeps == 1:
-            body = [f"z = step({start}, s, before, (before + now) / 2, now)"]
         else:
-            body = [
-                f"ua, ub, uc = (before + (j + c) / {self.substeps} * (now - before) for c in (0, 0.5, 1))",
-                f"z = step({start}, s, ua, ub, uc)",
-            ]
+            end = "end" if any(held) else "now"
+            body = [f"end = np.where({held}, before, now)  # inputs that are held"] if any(held) else []
+            if self.substeps == 1:
+                body.append(f"z = step({start}, s, before, (before + {end}) / 2, {end})")
+            else:
+                part = f"(j + c) / {self.substeps} * ({end} - before)"
+                body.append(f"ua, ub, uc = (before + {part} for c in (0, 0.5, 1))")
+                body.append(f"z = step({start}, s, ua, ub, uc)")
         if place is not None and stiff:
             i = place.velocity
             body.append(f"bristle = bend(bristle, 0.5 * (s[{i}] + z[{i}]), h)")

@@ -90,7 +90,7 @@ def write_fmu(twin: Corrected, module: str, out: Path) -> None:
     """
     if isinstance(twin.model.twin, OpaqueTwin):
         raise InputError(f"a {twin.kind} twin is a program of its own; use --out FILE.py, FILE.toml or FILE.csv")
-    if getattr(twin.model.twin, "hold", "") == "smooth":
+    if "smooth" in getattr(twin.model.twin, "holds", {}).values():
         raise InputError(
             "a smooth input (hold) depends on samples that an FMU has not seen yet; use --out FILE.py, FILE.toml or"
             " FILE.csv"

@@ -203,7 +203,6 @@ class _Module:
             k = self._put("stiffness", self.base["stiffness"], f"{f}/{x}") if "stiffness" in self.base else "0.0"
             offset = self._put("offset_force", self.base["offset_force"], f)
             a, b = f"np.array([[0.0, 1.0], [-{k} / {m}, -{c} / {m}]])", f"np.array([[0.0], [1 / {m}]])"
-            hold = self.base.get("hold", "linear")
             self._put("start", self.start.tolist(), f"{x}, {x}/s")
             drive, place, speed = (
                 f"{_name(source)} + {offset}",
@@ -213,13 +212,12 @@ class _Module:
             rows = {o: f"x[:, {int(o == 'velocity')}]" for o in twin.outputs}
         else:
             a, b, _, _ = (f"np.array({self._put(n, self.base[n])})" for n in "ABCD")
-            hold = "discrete" if self.base.get("discrete") else self.base.get("hold", "linear")
             self._put("start", self.start.tolist())
             several = "np.stack([" + ", ".join(_name(s) for s in twin.inputs) + "], axis=1)"
             drive = several if len(twin.inputs) > 1 else _name(next(iter(twin.inputs)))
             place = 'np.array(p["C"])[0]'
             cp, bm = (np.asarray(self.base[n], np.float64) for n in "CB")
-            if hold == "discrete":
+            if "discrete" in twin.holds.values():
                 speed = 'np.array(p["C"])[0] @ (np.array(p["A"]) - np.eye(len(p["A"]))) / dt'
             elif abs(float(cp[0] @ bm[:, 0])) < 1e-12 * float(np.abs(cp[0]) @ np.abs(bm[:, 0]) + 1e-300):
                 speed = 'np.array(p["C"])[0] @ np.array(p["A"])'
@@ -237,29 +235,33 @@ class _Module:
                 drive = "drive"
         start = 'np.array(p["start"])'
         forces = [k for k, pl in enumerate(self.model.placed) if pl.site == "feedback"]
-        if hold == "smooth":
-            # the future of an input is unknown step by step
-            self.writer.used |= {"smoothed"}
-            hold, drive = "linear", f"smoothed({drive})"
+        hold, drive = self._held(twin, drive)
         if forces:
-            self._forced(twin, forces, PlantCode(a, b, place, speed, str(hold), start))
+            self._forced(twin, forces, PlantCode(a, b, place, speed, hold, start))
             add(f"x = moving({drive})")
         else:
-            self.writer.part("linear", f"{a}, {b}, dt, {str(hold)!r}, {start}", "moving")
+            self.writer.part("linear", f"{a}, {b}, dt, {hold}, {start}", "moving")
             add(f"x = moving({drive})" if len(twin.inputs) > 1 else f"x = moving(({drive})[:, None])")
         for o, code in rows.items():
             add(f"{_name(o)} = {code}")
+
+    def _held(self, twin: DynamicTwin | CascadeTwin, drive: str) -> tuple[str, str]:
+        """Return the code of the hold of the inputs, and of what a linear or held course between samples may follow."""
+        holds = [twin.holds[s] for s in twin.inputs]
+        smooth = [h == "smooth" for h in holds]
+        if any(smooth):
+            # the future of an input is unknown step by step
+            self.writer.used |= {"smoothed"}
+            drive = f"smoothed({drive})" if all(smooth) else f"np.where({smooth}, smoothed({drive}), {drive})"
+        plain = ["linear" if h == "smooth" else h for h in holds]
+        return repr(plain[0] if len(set(plain)) == 1 else plain), drive
 
     def _first(self, twin: CascadeTwin) -> None:
         """Write the first filter, in front of the effects between two filters; it starts at rest."""
         table: Mapping[str, Any] = self.base["first"]
         a, b, c, d = (f"np.array({self._put(f'first.{n}', table[n])})" for n in "ABCD")
-        hold = "discrete" if self.base.get("discrete") else str(twin.hold)
-        drive = _name(twin.inputs[0])
-        if hold == "smooth":
-            self.writer.used |= {"smoothed"}
-            hold, drive = "linear", f"smoothed({drive})"
-        self.writer.part("linear", f"{a}, {b}, dt, {hold!r}, np.zeros(len({a}))", "in_front")
+        hold, drive = self._held(twin, _name(twin.inputs[0]))
+        self.writer.part("linear", f"{a}, {b}, dt, {hold}, np.zeros(len({a}))", "in_front")
         through = f" + {d}[0, 0] * {drive}" if np.any(np.asarray(table["D"]) != 0.0) else ""
         self.writer.run.append(f"{BETWEEN} = in_front(({drive})[:, None]) @ {c}[0]{through}")
 

@@ -19,7 +19,7 @@ from tools.mismatch.twins.feedback import pack
 
 def substeps_of(twin: DynamicTwin, model: Model, theta: Array, recording: Recording, forces: Sequence[int]) -> int:
     """Return the steps per sample that the engine takes with these forces."""
-    if twin.hold == "discrete":
+    if twin.holds[twin.inputs[0]] == "discrete":
         return 1
     placed = [(model.placed[k], *model.slices(k)) for k in forces]
     packed = pack([Force(pl.effect, pl.settings, theta[a], theta[b], b.start) for pl, a, b in placed])
@@ -45,6 +45,7 @@ class PlantCode:
     place: str
     speed: str
     hold: str
+    """As code."""
     start: str
 
 
@@ -59,10 +60,10 @@ def motion(codes: Sequence[ForceCode], plant: PlantCode, substeps: int) -> list[
     lean = next((c.lean for c in codes if c.lean), "")
     radii = next((c.radii for c in codes if c.radii), "")
     springs = next((c.springs for c in codes if c.springs), "")
-    straight = plant.hold == "linear"
+    straight = plant.hold == "'linear'"
     step = "dt" if substeps == 1 else f"dt / {substeps}"
     lines = [
-        f"ad, g0, g1 = discretise({plant.a}, {plant.b}, {step}, {plant.hold!r})",
+        f"ad, g0, g1 = discretise({plant.a}, {plant.b}, {step}, {plant.hold})",
         f"g0, g1, place, speed = g0[:, 0], g1[:, 0], {plant.place}, {plant.speed}  # rows of position and velocity",
         f"s, before = {plant.start}, None",
     ]

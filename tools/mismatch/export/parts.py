@@ -227,13 +227,13 @@ def exponential(m):
 
 
 def discretise(a, b, dt, hold):
-    """ad, g0, g1 of x[k+1] = ad x[k] + g0 u[k] + g1 u[k+1], exact for held or straight u (Van Loan 1978)."""
+    """ad, g0, g1 of x[k+1] = ad x[k] + g0 u[k] + g1 u[k+1], exact for held ("zero") or straight u (Van Loan 1978)."""
     if hold == "discrete":
         return a, b, 0 * b
     s, m = b.shape
     e = exponential(np.block([[a * dt, b * dt, 0 * b], [np.zeros((m, s + m)), np.eye(m)], [np.zeros((m, s + 2 * m))]]))
-    held, ramp = e[:s, s : s + m], e[:s, s + m :]
-    return (e[:s, :s], held, 0 * b) if hold == "zero" else (e[:s, :s], held - ramp, ramp)
+    held, ramp = e[:s, s : s + m], e[:s, s + m :] * (np.array(hold) != "zero")
+    return e[:s, :s], held - ramp, ramp
 
 
 def smoothed(u):

@@ -14,14 +14,15 @@ from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import conclude
-from tools.mismatch.engine.hold import delay_is_hold, with_hold
+from tools.mismatch.engine.hold import with_hold
 from tools.mismatch.engine.identifiability import LeastNamed, experiment
 from tools.mismatch.engine.pose import Posed, pose, run_through
-from tools.mismatch.engine.report import Alternative, Equivalent, Hold, Report, Sealed
+from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated
+from tools.mismatch.infer.holds import better_holds
 from tools.mismatch.infer.sealed import score_sealed, seal
 from tools.mismatch.infer.search import Found, look, search
 from tools.mismatch.infer.store import Scored, Store
@@ -69,23 +70,12 @@ def diagnose(
     inferred = find(recording)
     with threadpool_limits(1), np.errstate(all="ignore"):
         answer = decide(inferred.found.store, inferred.found.first)
-        if names_the_hold(inferred, answer):
-            inferred = find(with_hold(recording, "zero"))
-            inferred = replace(inferred, posed=replace(inferred.posed, hold=Hold("zero", "instead_of_delay")))
+        if held := better_holds(inferred.found.store, answer.chosen, inferred.posed.holds):
+            inferred = find(with_hold(recording, dict.fromkeys(held, "zero")))
+            inferred = replace(inferred, posed=replace(inferred.posed, holds={**inferred.posed.holds, **held}))
             answer = decide(inferred.found.store, inferred.found.first)
         report = report_of(inferred, answer, held_out, jobs)
     return replace(report, seconds=time.perf_counter() - began)
-
-
-def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
-    """Return True if the answer has a delay of half a sample and the data did not determine the hold of the inputs.
-
-    Held inputs explain as much, and no machine has such a delay.
-    """
-    hold, store = inferred.posed.hold, inferred.found.store
-    if hold is None or hold.how != "assumed" or not answer.chosen.placed:
-        return False
-    return delay_is_hold(store.problem, answer.chosen.fitted)
 
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:

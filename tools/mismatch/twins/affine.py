@@ -61,8 +61,10 @@ class Steps:
         return run_pushed(self.ad, pushed, x0, starts, stop)
 
 
-def exact_steps(rates: Callable[[Array, Array], Array], typical: Array, signals: Array, dt: float, held: bool) -> Steps:
-    """Return the exact steps of affine derivatives ``rates(x, u)`` (s,) for signals that are held or straight.
+def exact_steps(
+    rates: Callable[[Array, Array], Array], typical: Array, signals: Array, dt: float, held: NDArray[np.bool_]
+) -> Steps:
+    """Return the exact steps of affine derivatives ``rates(x, u)`` (s,) for signals that are ``held`` (m,) or straight.
 
     ``typical`` (s,) and ``signals`` (m,): sizes of states and signals.
     """
@@ -74,7 +76,7 @@ def exact_steps(rates: Callable[[Array, Array], Array], typical: Array, signals:
     # states and signals in units of their sizes; the last signal is the constant one
     a = slope[:, :s] / own[:, None]
     b = np.column_stack([slope[:, s:], rates(np.zeros(s), np.zeros(m))]) / own[:, None]
-    each = [discretise(a, column, dt, "zero" if held else "linear") for column in b.T]
+    each = [discretise(a, column, dt, "zero" if h else "linear") for column, h in zip(b.T, (*held, True), strict=True)]
     before = np.stack([d.g0 for d in each], axis=1) * own[:, None]
     after = np.stack([d.g1 for d in each], axis=1) * own[:, None]
     ad = each[0].ad * own[:, None] / own

@@ -12,6 +12,7 @@ from tools.errors import RecordingError
 from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
+from tools.mismatch.twins.holds import holds_text, read_holds
 
 _NAMES = names(PARAMETERS["mechanical_axis"])
 
@@ -25,11 +26,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
                 f"{recording.path}: [twin.parameters] '{key}' is not a parameter of mechanical_axis;"
                 f" known: {', '.join(_NAMES)}"
             )
-    hold = text.get("hold", "linear")
-    if hold not in ("zero", "linear", "smooth"):
-        raise RecordingError(
-            f"{recording.path}: [twin.parameters] hold must be 'zero', 'linear' or 'smooth', got {hold!r}"
-        )
+    holds = read_holds(recording)
     given = {k: _number(recording, k, text.get(k)) for k in _NAMES[:4]}
     if given["mass"] is not None and given["mass"] <= 0:
         raise RecordingError(f"{recording.path}: [twin.parameters] mass must be positive, got {given['mass']}")
@@ -69,7 +66,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
     def text_of(theta: Array) -> dict[str, object]:
         out: dict[str, object] = {h.name: float(h.value) for h in human_of(theta)}
         if "hold" in text:
-            out["hold"] = hold
+            out["hold"] = holds_text(holds)
         return out
 
     rates = np.roots([1.0, damping / mass, stiffness / mass])
@@ -81,7 +78,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
         parameters=tuple(parameters),
-        hold=hold,
+        holds=holds,
         links=tuple(links),
         groups=({o: row[o] for o in outputs},),
         begin=np.array(begin),

@@ -56,6 +56,14 @@ class Force:
 
 
 @dataclass(frozen=True)
+class Path:
+    """Carries an output (n,) through the linear effects behind it, to what was measured; ``token`` identifies it."""
+
+    carry: Callable[[Array], Array]
+    token: tuple[object, ...]
+
+
+@dataclass(frozen=True)
 class Run:
     """Describes the simulated stretch of a recording and its start states.
 
@@ -65,7 +73,8 @@ class Run:
     samples after which all inputs and outputs repeat from every start on (0: they do not); it then sets the start
     states. ``afresh``: samples at which the memory of effects restarts. ``bent``: True if a nonlinear effect stands
     between the states and the measured outputs, which are then no linear function of a start state. ``wanted``: sorted
-    sample numbers of which alone a response may consist (None: it consists of all).
+    sample numbers of which alone a response may consist (None: it consists of all). ``paths``: of the outputs that were
+    measured behind linear effects; ``about``: an earlier run of these outputs (n,), else they are zero there.
     """
 
     t: Array
@@ -81,6 +90,17 @@ class Run:
     afresh: tuple[int, ...] = (0,)
     bent: bool = False
     wanted: NDArray[np.int64] | None = None
+    paths: Mapping[str, Path] = field(default_factory=dict[str, Path])
+    about: Mapping[str, Array] = field(default_factory=dict[str, Array])
+
+    def shown(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
+        """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""
+        path = self.paths.get(output)
+        if path is None:
+            return y
+        full = self.about[output].copy() if output in self.about else np.zeros(self.t.size)
+        full[at] = y
+        return path.carry(full)[at]
 
     @property
     def start_window(self) -> int:

@@ -19,7 +19,8 @@ from tools.mismatch.recording import Recording, TwinText
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, discretise_blocks
 from tools.mismatch.twins.head import Head
-from tools.mismatch.twins.linear import Hold, between_samples, run_states
+from tools.mismatch.twins.holds import Holds, read_holds
+from tools.mismatch.twins.linear import between_samples, run_states
 from tools.mismatch.twins.memo import remember
 
 BETWEEN = "between"
@@ -36,7 +37,7 @@ class CascadeTwin(Head):
     second: DynamicTwin
     free: tuple[int, ...]
     restart: bool
-    hold: Hold
+    holds: Holds
     fastest_per_s: float
     feedback_on: str = ""
     static: bool = False
@@ -84,11 +85,12 @@ class CascadeTwin(Head):
     def _first(self, run: Run, u: Array, own: Array) -> Array:
         plant = self.first.plant_of(own)
         y = np.zeros(u.size)
-        inside = np.ascontiguousarray(between_samples(u, self.hold), np.float64)
+        hold = self.holds[self.inputs[0]]
+        inside = np.ascontiguousarray(between_samples(u, hold), np.float64)
         start = np.zeros(1, np.int64)
         states = [
             run_states(d.ad, d.g0, d.g1, inside, np.zeros((1, d.ad.shape[0])), start)
-            for d in discretise_blocks(plant, run.dt, self.hold)
+            for d in discretise_blocks(plant, run.dt, hold)
         ]
         x = np.concatenate(states, axis=1) if states else np.zeros((u.size, 0))
         for link in self.first.links:
@@ -145,6 +147,8 @@ def cascade_twin(recording: Recording, build: Callable[[Recording], DynamicTwin]
     if not isinstance(table, Mapping) or not set(table) <= set(FILTER):
         raise RecordingError(f"{where} must be a table with A, B, C and D")
     (source, drive), (output, _) = *recording.inputs.items(), *recording.outputs.items()
+    if "hold" in text:
+        text["hold"] = read_holds(recording)[source]  # both filters name their input otherwise
     shared: dict[str, Any] = {k: text[k] for k in ("hold", "discrete") if k in text}
     units = {**recording.unit, BETWEEN: recording.unit[source]}
     rest = {k: v for k, v in text.items() if k != "x0"}
@@ -170,6 +174,6 @@ def cascade_twin(recording: Recording, build: Callable[[Recording], DynamicTwin]
         second=second,
         free=free,
         restart=first.restart or second.restart,
-        hold=second.hold,
+        holds={source: second.holds[BETWEEN]},
         fastest_per_s=max(first.fastest_per_s, second.fastest_per_s),
     )

@@ -13,6 +13,7 @@ from tools.mismatch.twins.base import Counted, Force, Run, Signal, travelled
 from tools.mismatch.twins.feedback import Body, Rows, pack
 from tools.mismatch.twins.forced import ForcedRun
 from tools.mismatch.twins.head import Head
+from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import (
     Discrete,
     Hold,
@@ -69,7 +70,7 @@ class DynamicTwin(Head):
     response to the engineer's own start state, used when no sample may set it; ``start_given``: the engineer gave one.
     """
 
-    hold: Hold
+    holds: Holds
     links: tuple[Link, ...]
     groups: tuple[Mapping[str, int | tuple[int, ...]], ...]
     begin: Array
@@ -129,19 +130,24 @@ class DynamicTwin(Head):
         n = run.t.size
         plant = self.plant_of(theta)
         # one state and one input: a single run from the right start state does, without columns
-        alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2
+        alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2 and not run.paths
         if forces or (alone and run.setting is None and (self.start_given or not run.period)):
             return self._with_forces(run, inputs, theta, forces)
-        d = discretise_blocks(plant, run.dt, self.hold)
+        by_hold: dict[Hold, list[Discrete]] = {
+            h: discretise_blocks(plant, run.dt, h) for h in dict.fromkeys(self.holds.values())
+        }
+        d = next(iter(by_hold.values()))
         where = {r: (k, r - a) for k, (a, b) in enumerate(plant.parts) for r in range(a, b)}
-        tags = [(d[k].ad.tobytes(), d[k].g0.tobytes(), d[k].g1.tobytes(), run.starts) for k in range(len(d))]
+        tags = {
+            h: [(b.ad.tobytes(), b.g0.tobytes(), b.g1.tobytes(), run.starts) for b in of] for h, of in by_hold.items()
+        }
         value: dict[str, Array] = {o: np.zeros(n) for o in self.outputs}
         columns: dict[int, dict[str, Array]] = {}
         folded: list[float] = []
 
-        def states(u: Array, token: object, k: int) -> Array:
-            key = ("states", token, tags[k])
-            return remember(run.memo, key, lambda: _states(d[k], between_samples(u, self.hold), run.starts))
+        def states(u: Array, token: object, k: int, hold: Hold) -> Array:
+            key = ("states", token, tags[hold][k])
+            return remember(run.memo, key, lambda: _states(by_hold[hold][k], between_samples(u, hold), run.starts))
 
         def add(j: int, output: str, column: Array) -> None:
             if join:
@@ -155,6 +161,7 @@ class DynamicTwin(Head):
             links = [link for link in self.links if link.source == source]
             drive = Signal(one, {}, (CONSTANT,)) if source == CONSTANT else inputs[source]
             normal = self._gain_index(source) >= 0
+            hold = self.holds[source] if source else next(iter(by_hold))  # a constant is the same for each
             parts: list[tuple[int, Array, object]] = [(-1, drive.value, drive.token)]
             if drive.columns and normal:
                 if join:
@@ -172,7 +179,7 @@ class DynamicTwin(Head):
                 parts = [(-1, np.asarray(total), (*drive.token, keys))]
             for j, u, token in parts:
                 needed = sorted({where[link.row][0] for link in links if link.row >= 0})
-                x = {k: states(u, token, k) for k in needed}
+                x = {k: states(u, token, k, hold) for k in needed}
                 for link in links:
                     if link.row < 0:
                         column = u
@@ -180,7 +187,8 @@ class DynamicTwin(Head):
                         k, r = where[link.row]
                         column = x[k][:, r]
                     add(link.j if j < 0 else j, link.output, column)
-        token = ("plant", tuple(tags), run.window, run.bent)
+        token = ("plant", *map(tuple, tags.values()), run.window, run.bent)
+        token = (*token, *((o, p.token) for o, p in run.paths.items()))
         token = (*token, *(x.token for x in inputs.values()), tuple(folded))
         if join:
             token = (*token, theta[: len(self.parameters)].tobytes())
@@ -189,8 +197,9 @@ class DynamicTwin(Head):
     def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
         """See Twin."""
         source = signal or self.inputs[0]
+        hold = self.holds[source]
         plant = self.plant_of(theta)
-        d = discretise_blocks(plant, run.dt, self.hold)
+        d = discretise_blocks(plant, run.dt, hold)
         normal = self._gain_index(source) >= 0
         group = next((g for g in self.groups if output in g), None)
         outputs = tuple(group or (output,))
@@ -210,7 +219,7 @@ class DynamicTwin(Head):
         def carry(change: Array) -> Array:
             u = _once(change)
             y = {o: direct[o] * u for o in outputs}
-            u = _once(between_samples(u, self.hold))
+            u = _once(between_samples(u, hold))
             for o in outputs:
                 for part, (a, b) in zip(d, plant.parts, strict=True):
                     c = rows[o][a:b]
@@ -239,6 +248,7 @@ class DynamicTwin(Head):
         """Add the free response of the start states: the engineer's, or those that the first samples determine."""
         n = run.t.size
         zero = np.zeros(n)
+        nothing = dict.fromkeys(self.outputs, zero)
         given = self.start_given or (run.window == 0 and not run.period)
         read = run.setting is not None and not (run.bent and self.at_rest)
         if given and not read and self.fixed_free is not None and run.starts == (0,):
@@ -249,11 +259,7 @@ class DynamicTwin(Head):
                 # a value and its columns are settled alike: the start state is an affine function of them
                 ss = self._start_state(run, ad, blocks, group)
                 group_values = {o: value[o] for o in group}
-                x0 = (
-                    ss.steady(group_values, run.period)
-                    if run.period
-                    else ss.states({o: run.measured[o] - group_values[o] for o in group_values})
-                )
+                x0 = ss.steady(group_values, run.period) if run.period else ss.met(group_values, run.measured)
                 if run.wanted is not None:
                     self._settle_at(run, ss, x0, value, columns)
                     continue
@@ -263,7 +269,7 @@ class DynamicTwin(Head):
                     if not any(o in entry for o in group):
                         continue
                     group_values = {o: entry.get(o, zero) for o in group}
-                    x0 = ss.steady(group_values, run.period) if run.period else -ss.states(group_values)
+                    x0 = ss.steady(group_values, run.period) if run.period else ss.met(group_values, nothing)
                     for o in group:
                         # a copy, because the column may be cached
                         entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
@@ -362,7 +368,7 @@ class DynamicTwin(Head):
             direct = direct + (1.0 if has_gain else g) * theta[j] * c
         rows = {o: no_row.copy() for o in self.outputs}
         extra = {o: np.zeros(direct.size) for o in self.outputs}
-        u = between_samples(direct, self.hold)
+        u = between_samples(direct, self.holds[source])
         for j in {link.j for link in self.links if link.source == CONSTANT and link.row != -2}:
             u = u + theta[j]
         for link in self.links:
@@ -382,19 +388,19 @@ class DynamicTwin(Head):
         Bristles of ``packed`` that are too stiff for the finest step become rigid, in place.
         """
         cp = np.eye(plant.a.shape[0])[0] if self.counted else rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
-        sub = 1
-        if has_forces and self.hold != "discrete":
+        sub, hold = 1, self.holds[self.inputs[0]]
+        if has_forces and hold != "discrete":
             push = float(cp @ plant.a @ plant.b) or 1.0
             packed.friction[5] = min(packed.friction[5], (0.7 * MOST_SUBSTEPS / run.dt) ** 2 / abs(push))
             sub = self._substeps(run, packed, push)
-        d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
+        d = discretise(plant.a, plant.b, run.dt / sub, hold)
         if self.counted or ("velocity" in self.outputs and self.feedback_on == "position"):
             cv = rows["velocity"]
-        elif self.hold == "discrete":
+        elif hold == "discrete":
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
         else:
             cv = cp @ plant.a if abs(cp @ plant.b) < 1e-12 * (np.abs(cp) @ np.abs(plant.b) + 1e-300) else cp
-        held = self.hold in ("zero", "discrete")
+        held = hold in ("zero", "discrete")
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
         return Body(d.ad, d.g0, d.g1, cp, cv, held, sub, run.dt / sub, dry)
 

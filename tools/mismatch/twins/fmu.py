@@ -20,6 +20,7 @@ from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording
+from tools.mismatch.twins.holds import common_hold
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
 
 OWN_KEYS = ("path", "hold")
@@ -112,8 +113,7 @@ def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
     if not path.is_file():
         raise RecordingError(f"{where} path: {path} does not exist")
     start = {k: v for k, v in recording.twin.parameters.items() if k not in OWN_KEYS}
-    if recording.twin.parameters.get("hold", "linear") not in ("zero", "linear"):
-        raise RecordingError(f"{where} hold must be 'zero' or 'linear', got {recording.twin.parameters['hold']!r}")
+    common_hold(recording)
     run = FmuRun(path, tuple(recording.outputs), recording.dt, recording.path, tuple(recording.inputs), start)
     known = run.names()
     lost = [s for s in (*recording.inputs, *recording.outputs, *start) if s not in known]
@@ -126,8 +126,8 @@ def fmu_twin(recording: Recording) -> OpaqueTwin:
     """Return an FMU for co-simulation as an opaque program."""
     path, run = opened_fmu(recording)
     twin = opaque_twin(recording, run, str(path), fixed=OWN_KEYS)
-    hold = str(recording.twin.parameters.get("hold", "linear"))
-    return replace(twin, hold=hold, given={**twin.given, "hold": hold})
+    hold = common_hold(recording)
+    return replace(twin, holds=dict.fromkeys(twin.inputs, hold), given={**twin.given, "hold": hold})
 
 
 def with_equations(recording: Recording) -> Recording:

@@ -78,7 +78,9 @@ class ForcedRun:
         x0 = np.zeros((1, self.order))
         for _ in range(2):
             x = self.states(x0, self.u, self.starts, self.ends)
-            missed = {o: self.run.measured[o] - self.extra[o] - x @ row for o, row in self.rows.items()}
+            every = np.arange(self.run.t.size)
+            shown = {o: self.run.shown(o, self.extra[o] + x @ row, every) for o, row in self.rows.items()}
+            missed = {o: self.run.measured[o] - y for o, y in shown.items()}
             x0 = x0 + ss.states(missed)
         return x0
 
@@ -103,7 +105,7 @@ class ForcedRun:
         for _ in range(1 if self.forces is None else 3):
             x = self.states(x0, part, before, after)
             for o, row in self.rows.items():
-                need[o][seen] = run.measured[o][seen] - self.extra[o][seen] - x @ row
+                need[o][seen] = run.measured[o][seen] - run.shown(o, self.extra[o][seen] + x @ row, seen)
             x0 = x0 + ss.states(need)
         return x0
 

@@ -16,7 +16,7 @@ from sim_devices.physics.exponential import exponential
 from tools.mismatch.twins.memo import remember, stored
 
 if TYPE_CHECKING:
-    from tools.mismatch.twins.base import Run
+    from tools.mismatch.twins.base import Path, Run
 
 Hold = Literal["zero", "linear", "smooth", "discrete"]
 """Course of an input between its samples: held, straight, or without content above half the sampling rate."""
@@ -282,7 +282,7 @@ class StartState:
 
     ``free[o]`` (while felt, s) of each block; ``samples`` of each start that may set its state, and ``solvers``
     (s, outputs * samples): the least-squares inverse of the stacked, weighted free responses there. ``shared`` is the
-    cache of the view.
+    cache of the view. ``paths``: of the outputs that were measured behind linear effects.
     """
 
     outputs: tuple[str, ...]
@@ -294,6 +294,7 @@ class StartState:
     solvers: tuple[Array, ...]
     ad: Array
     shared: dict[object, object] = field(compare=False, repr=False)
+    paths: Mapping[str, Path] = field(compare=False, repr=False)
     memo: dict[object, Array] = field(default_factory=dict[object, Array], compare=False, repr=False)
 
     def inverses(self, rows: Mapping[str, Array], rough: float, window: int) -> tuple[Array, ...]:
@@ -312,16 +313,51 @@ class StartState:
 
         shapes = {o: np.concatenate([shape_of(c, a, b) for a, b in self.blocks], axis=1) for o, c in rows.items()}
         shape = np.concatenate([x * self.weight[o] for o, x in shapes.items()])
+        behind = {o: self.behind(o) for o in rows if o in self.paths}
         known: dict[bytes, Array] = {}
         solvers: list[Array] = []
-        for (a, _), samples in zip(self.spans, self.samples, strict=True):
+        for i, ((a, _), samples) in enumerate(zip(self.spans, self.samples, strict=True)):
             since = samples - a
-            name = since.tobytes()
+            name = since.tobytes() if not behind else samples.tobytes()
             if name not in known:
-                seen = [_padded(self.free[o], since, self.shared) * self.weight[o] for o in rows]
+                seen = [
+                    (behind[o][i % 2][samples] if o in behind else _padded(self.free[o], since, self.shared))
+                    * self.weight[o]
+                    for o in rows
+                ]
                 known[name] = held_inverse(np.concatenate(seen), shape, rough)
             solvers.append(known[name])
         return tuple(solvers)
+
+    def behind(self, output: str) -> tuple[Array, Array]:
+        """Return what is measured of the free responses to unit start states (n, s) of every other stretch.
+
+        The response of a stretch goes on behind its end, so that neighbours are carried apart.
+        """
+        n, s = self.spans[-1][1], self.ad.shape[0]
+        out = np.zeros((2, n, s))
+        for i, (a, b) in enumerate(self.spans):
+            for (first, last), free in zip(self.blocks, self.free[output], strict=True):
+                felt = free[: b - a]
+                out[i % 2, a : a + felt.shape[0], first:last] = felt
+        for part in out[: min(len(self.spans), 2)]:
+            for k in range(s):
+                part[:, k] = self.paths[output].carry(np.ascontiguousarray(part[:, k]))
+        return out[0], out[1]
+
+    def measured(self, y: Mapping[str, Array]) -> dict[str, Array]:
+        """Return what is measured (n,) of outputs ``y``."""
+        return {o: self.paths[o].carry(x) if o in self.paths else x for o, x in y.items()}
+
+    def met(self, y: Mapping[str, Array], wanted: Mapping[str, Array]) -> Array:
+        """Return start states (starts, s) with which outputs, ``y`` (n,) from rest, are measured as ``wanted`` (n,)."""
+        seen = self.measured(y)
+        x0 = self.states({o: wanted[o] - seen[o] for o in self.outputs})
+        if self.paths and len(self.spans) > 1:
+            # a stretch begins with what its predecessor leaves in the effects
+            seen = self.measured({o: self.added(y[o].copy(), x0, o) for o in self.outputs})
+            x0 = x0 + self.states({o: wanted[o] - seen[o] for o in self.outputs})
+        return x0
 
     def states(self, need: dict[str, Array]) -> Array:
         """Return start states (starts, s) whose free response fits ``need`` (n,) per output at the samples."""
@@ -404,7 +440,9 @@ def start_state(ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = Tr
     """
     starts, n, window, setting, memo = run.starts, run.t.size, run.start_window, run.setting, run.memo
     how = ("set", setting.size) if setting is not None else ("window", window)
-    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, how, whole)
+    paths = {o: p for o, p in run.paths.items() if o in rows}
+    passed = tuple((o, p.token) for o, p in paths.items())
+    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, how, whole, passed)
     found = memo.get(key)
     if isinstance(found, StartState):
         return found
@@ -432,7 +470,7 @@ def start_state(ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = Tr
     # outputs that show the states alike share the inverse
     same = ("solvers", ad.tobytes(), tuple((c.tobytes(), weight[o]) for o, c in rows.items()), rough, *key[3:])
     solvers = memo.get(same)
-    made = StartState(tuple(rows), parts, free, weight, spans, at, (), ad, memo)
+    made = StartState(tuple(rows), parts, free, weight, spans, at, (), ad, memo, paths)
     if not isinstance(solvers, tuple):
         solvers = made.inverses(rows, rough, window)
         stored(memo, same, solvers, sum({id(x): x.nbytes for x in solvers}.values()))

@@ -31,6 +31,7 @@ from tools.mismatch.twins.equations import (
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.forced import shot_to_repeat
 from tools.mismatch.twins.head import Head
+from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode_run import SWAY, Drive
@@ -53,7 +54,7 @@ class OdeTwin(Head):
     names: tuple[str, ...]
     free: tuple[int, ...]
     given: Mapping[str, Any]
-    held: bool
+    holds: Holds
     text_of: Callable[[Mapping[str, float]], dict[str, object]] = field(repr=False)
     parameter_units: Mapping[str, str]
     typical: Array
@@ -70,10 +71,10 @@ class OdeTwin(Head):
     apart: bool = False
     counted: Counted = ""
 
-    @property
-    def hold(self) -> str:
-        """Return the hold of the inputs between their samples: "zero" or "linear"."""
-        return "zero" if self.held else "linear"
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Return True for each of ``signals`` (m,) that is held between its samples; the others run straight."""
+        return np.array([self.holds.get(s) == "zero" for s in self.signals])
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
@@ -197,7 +198,7 @@ class OdeTwin(Head):
         """See Twin. Nothing stays linear behind the equations."""
         used = {s: fold(x, theta) for s, x in inputs.items()}
         key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window)
-        key = (*key, *(x.token for x in used.values()))
+        key = (*key, *(x.token for x in used.values()), *((o, p.token) for o, p in run.paths.items()))
         key = (*key, *((f.effect.form, f.target, f.q.tobytes(), f.weights.tobytes(), _settings(f)) for f in forces))
 
         def make() -> Array:
@@ -279,13 +280,12 @@ class OdeTwin(Head):
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
 
-        held = np.full(len(self.signals), self.held)
         steps = self.exact_steps(run.dt, values) if self.has_exact_steps and not forces else None
 
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
             if steps is not None:
                 return steps.run(x0, u, first, stop)
-            drive = Drive(u, held, t, run.dt, sub, first, stop)
+            drive = Drive(u, self.held, t, run.dt, sub, first, stop)
             return self.equations.states(x0, drive, values, inside, limits)
 
         given = np.array([[x.start for x in self.state_list]])
@@ -314,12 +314,12 @@ class OdeTwin(Head):
 
         def misses(x0: Array) -> Array:
             x = go(x0, before, after, part, t)
-            return (y - self.equations.readings(x, part, t, values)) * weight
+            return (y - self._shown(run, self.equations.readings(x, part, t, values), seen)) * weight
 
         def plain() -> Array:
             # a run of the engineer's own model from its own start gives first guesses for later stretches
             end = np.array([run.t.size], np.int64)
-            drive = Drive(u, held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
+            drive = Drive(u, self.held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
             return self.equations.states(given, drive, self.start_values, NOTHING, limits)[starts]
 
         x0 = remember(run.memo, ("about", run.starts), plain)
@@ -339,12 +339,15 @@ class OdeTwin(Head):
             return every
 
         tried: list[tuple[Array, Array]] = []
-        part, t = u[seen], run.t[seen]
+        every = np.arange(run.t.size)
+        at = every if run.paths else seen  # what is measured behind effects depends on all that was before
+        part, t = u[at], run.t[at]
 
         def misses_all(some: Array) -> Array:
             x = go(with_some(some), starts, ends, u, run.t)
             tried.append((some, x))
-            return (y - self.equations.readings(x[seen], part, t, values)) * weight
+            shown = self.equations.readings(x[at], part, t, values)
+            return (y - (self._shown(run, shown, every)[seen] if run.paths else shown)) * weight
 
         found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
         # each stretch starts anew, and has been run from the state that was found
@@ -353,6 +356,12 @@ class OdeTwin(Head):
             x = next(x for some, x in tried if np.array_equal(some[k], found[k], equal_nan=True))
             out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
         return out
+
+    def _shown(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
+        """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""
+        if not run.paths:
+            return y
+        return np.stack([run.shown(o, y[:, i], at) for i, o in enumerate(self.outputs)], axis=1)
 
     @cached_property
     def has_exact_steps(self) -> bool:
@@ -386,7 +395,7 @@ class OdeTwin(Head):
         else:
             b = np.zeros(len(self.state_list))
             b[self.place(signal).target] = 1.0
-        d = discretise(lin.a, b, run.dt, "zero" if self.held else "linear")
+        d = discretise(lin.a, b, run.dt, self.holds.get(signal, "linear"))
         c = dict(zip(self.outputs, lin.c, strict=True))
         ss = start_state(d.ad, c, run if self.integrates else replace(run, setting=None))
         at = np.array(run.starts, np.int64)

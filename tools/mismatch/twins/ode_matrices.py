@@ -9,6 +9,7 @@ from typing import Any
 from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.mismatch.recording import Recording
+from tools.mismatch.twins.holds import holds_text
 from tools.mismatch.twins.ode import OdeTwin
 from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.state_space import Matrices
@@ -59,7 +60,7 @@ def physical_twin(recording: Recording, m: Matrices) -> OdeTwin:
             numbers[name], at[name] = float(m.y0[k]), ("y0", k, 0)
             parts.append(name)
         readings[o] = " + ".join(parts) or "0"
-    text = {**numbers, "states": states, "equations": equations, "outputs": readings, "hold": m.hold}
+    text = {**numbers, "states": states, "equations": equations, "outputs": readings, "hold": holds_text(m.holds)}
     given = recording.twin.parameters
     twin = ode_twin(replace(recording, twin=replace(recording.twin, parameters=text)))
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
@@ -18,6 +19,7 @@ from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, State, linearise, rates_at
+from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.program import parse
@@ -62,9 +64,8 @@ def assembled(
 ) -> OdeTwin:
     """Build the twin around equations of any origin, with typical sizes from a run as given."""
     table, where = recording.twin.parameters, f"{recording.path}: [twin]"
-    hold = table.get("hold", "linear")
-    if hold not in ("zero", "linear"):
-        raise RecordingError(f"{where} hold must be 'zero' or 'linear', got {hold!r}")
+    holds = read_holds(recording, STRAIGHT_OR_HELD)
+    held = np.array([holds.get(s) == "zero" for s in signals])
     fixed = table.get("fixed", [])
     if not isinstance(fixed, Sequence) or isinstance(fixed, str) or any(f not in names for f in fixed):
         raise RecordingError(f"{where} fixed must list parameters that stay as given, got {fixed!r}")
@@ -74,7 +75,7 @@ def assembled(
     free = tuple(i for i, n in enumerate(names) if n not in fixed)
     values = np.array([float(table[n]) for n in names])
     u = np.column_stack([recording.signals[s] for s in signals])
-    x = _as_given(recording, equations, states, u, values, hold == "zero")
+    x = _as_given(recording, equations, states, u, values, held)
     typical = _typical(x, states)
     middle = (np.asarray(x.mean(axis=0), np.float64), np.asarray(u.mean(axis=0), np.float64))
     rates: list[complex] = []
@@ -106,7 +107,7 @@ def assembled(
         names=tuple(names),
         free=free,
         given=dict(table),
-        held=hold == "zero",
+        holds=holds,
         text_of=text_of,
         parameter_units=dict(own_units),
         typical=typical,
@@ -120,7 +121,12 @@ def assembled(
 
 
 def _as_given(
-    recording: Recording, equations: Equations, states: tuple[State, ...], u: Array, values: Array, held: bool
+    recording: Recording,
+    equations: Equations,
+    states: tuple[State, ...],
+    u: Array,
+    values: Array,
+    held: NDArray[np.bool_],
 ) -> Array:
     """Return states (n, s) of a free run with the engineer's numbers from the engineer's start."""
     n = u.shape[0]
@@ -131,9 +137,9 @@ def _as_given(
         a = linearise(equations, x0[0], u[0], typical, values).a
         fastest = float(np.max(np.abs(np.linalg.eigvals(a)))) if np.all(np.isfinite(a)) else 1.0 / recording.dt
         sub = int(np.clip(np.ceil(recording.dt * fastest / 0.25), 1, 200))
-        inputs, straight = np.ascontiguousarray(u), np.full(u.shape[1], held)
+        inputs = np.ascontiguousarray(u)
         whole = np.zeros(1, np.int64), np.array([n], np.int64)
-        drive = Drive(inputs, straight, recording.t, recording.dt, sub, *whole)
+        drive = Drive(inputs, held, recording.t, recording.dt, sub, *whole)
         x = equations.states(x0, drive, values, NOTHING, limits)
     if not np.all(np.isfinite(x)):
         k = int(np.argmax(~np.isfinite(x).all(axis=1)))

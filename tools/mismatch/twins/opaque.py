@@ -20,6 +20,8 @@ from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording, Simulate
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
+from tools.mismatch.twins.holds import Holds
+from tools.mismatch.twins.linear import Hold
 from tools.mismatch.twins.memo import remember
 
 
@@ -57,8 +59,8 @@ class OpaqueTwin:
     feedback_on: str = ""
     counted: Counted = ""
     source: str = field(default="", compare=False)
-    hold: str = ""
-    """Hold of the inputs that the program is told: "zero" (held) or "linear"; empty: it is not told."""
+    holds: Holds = field(default_factory=dict[str, Hold])
+    """Hold of the inputs, the same for each, that the program is told; empty: it is not told."""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""

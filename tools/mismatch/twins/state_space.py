@@ -17,7 +17,8 @@ from sim_devices.physics.exponential import exponential
 from tools.errors import RecordingError
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
-from tools.mismatch.twins.linear import Hold, run_states
+from tools.mismatch.twins.holds import Holds, holds_text, read_holds
+from tools.mismatch.twins.linear import run_states
 from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, modes_of, roots_of_mode, typical_size
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
@@ -36,7 +37,7 @@ class Matrices:
     x0: Array
     y0: Array
     discrete: bool
-    hold: Hold
+    holds: Holds
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
         parameters=parameters,
-        hold="discrete" if m.discrete else m.hold,
+        holds=dict.fromkeys(inputs, "discrete") if m.discrete else m.holds,
         links=links,
         groups=tuple({o: seen} for o in outputs) if poles.size else (),
         begin=np.array(start.values),
@@ -259,11 +260,7 @@ def read_matrices(recording: Recording) -> Matrices:
     s, p, q = a.shape[0], len(recording.inputs), len(recording.outputs)
     if a.shape[1] != s:
         raise RecordingError(f"{recording.path}: [twin.parameters] A has shape {a.shape}, it must be square")
-    hold = text.get("hold", "linear")
-    if hold not in ("zero", "linear", "smooth"):
-        raise RecordingError(
-            f"{recording.path}: [twin.parameters] hold must be 'zero', 'linear' or 'smooth', got {hold!r}"
-        )
+    holds = read_holds(recording)
     discrete = text.get("discrete", False)
     if not isinstance(discrete, bool):
         raise RecordingError(f"{recording.path}: [twin.parameters] discrete must be true or false, got {discrete!r}")
@@ -277,7 +274,7 @@ def read_matrices(recording: Recording) -> Matrices:
         x0[:, 0],
         y0[:, 0],
         discrete,
-        hold,
+        holds,
     )
 
 
@@ -433,7 +430,7 @@ def _text(
     for i in range(p):
         b[i * s : (i + 1) * s, i] = plant.b
     out: dict[str, object] = {"A": a.tolist(), "B": b.tolist(), "C": c.tolist(), "D": d.tolist(), "y0": y0.tolist()}
-    out["hold"] = m.hold
+    out["hold"] = holds_text(m.holds)
     if m.discrete:
         out["discrete"] = True
     return out

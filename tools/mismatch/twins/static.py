@@ -13,6 +13,7 @@ from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
+from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
 
 
 @dataclass(frozen=True)
@@ -118,10 +119,7 @@ def static_twin(recording: Recording) -> StaticTwin:
         drives[o] = drive
     text = recording.twin.parameters
     known = names(PARAMETERS[kind])
-    if text.get("hold", "linear") not in ("zero", "linear"):
-        raise RecordingError(
-            f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {text['hold']!r}"
-        )
+    read_holds(recording, STRAIGHT_OR_HELD)
     for key in text:
         # a twin without memory is the same for either hold at the samples, where it is compared
         if key not in known:
