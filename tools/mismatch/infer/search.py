@@ -11,7 +11,6 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.pose import hint_of, may_hint
 from tools.mismatch.engine.problem import Hint, Problem
-from tools.mismatch.engine.score import fit_rms
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort, Trial, try_all
 from tools.mismatch.infer.constants import Constants
@@ -114,24 +113,33 @@ class Search:
                 grown = more
 
     def pair(self) -> None:
-        """Extend effects that gain anything before their prices, where no set explains half of what can be explained.
+        """Extend the effects that fit best, where no set explains half of what can be explained.
 
         Of two effects that only together make the recording, each alone may gain less than its price, and an effect
         at many places less than at one. A ranking by score would not extend them.
         """
-        base = self.store.base
-        gain = {k: self.gain_before_prices(s) for k, s in self.store.sets.items() if s.proper}
-        if max(gain.values(), default=0.0) >= HALF * self.most_gain(base):
+        if self.explains_half():
             return
-        alone = [s for k, s in self.store.sets.items() if len(s.placed) == 1 and gain.get(k, 0.0) > 0.0]
-        # what a half of a pair leaves held out is noisy: how far each gets where it was fitted says more
-        left = {s.key: sum(np.log(v) for v in fit_rms(self.store.problem, s.fitted).values()) for s in alone}
+        alone = [s for s in self.store.sets.values() if len(s.placed) == 1 and s.proper]
+        # a half of a pair may be worse than nothing held out, and a flexible effect fits anything: all samples count
+        left = {s.key: self.left_over_all(s) for s in alone}
         alone.sort(key=lambda s: (left[s.key], sorted(s.key)))
         best = {s.names: s for s in reversed(alone)}
         for s in [s for s in alone if best[s.names] is s][:BEAM]:
-            if self.moves:
+            if self.moves and not self.explains_half():
                 self.moves -= 1
                 self.expand(s)
+
+    def explains_half(self) -> bool:
+        """Return True if a set explains half of what can be explained beside the base."""
+        gains = (self.gain_before_prices(s) for s in self.store.sets.values() if s.proper)
+        return max(gains, default=0.0) >= HALF * self.most_gain(self.store.base)
+
+    def left_over_all(self, s: Scored) -> float:
+        """Return the log of the residual rms over fitted and held-out samples, summed over the outputs."""
+        p = self.store.problem
+        rows = np.concatenate([p.fit_rows, p.held_rows])
+        return sum(0.5 * float(np.log(np.mean(r[rows] ** 2))) for r in s.fitted.residual.values())
 
     def gain_before_prices(self, s: Scored) -> float:
         """Return the nats that a set gains over the base before the prices of its names and parameters."""
