@@ -173,10 +173,6 @@ class Imu(Protocol):
         """Write and read back; the answer is what the chip keeps (its own steps). ``BenchError`` out of range."""
         ...
 
-    def persist_offsets(self, limit_s: float = 0.5) -> int:
-        """Keep the offsets over power-off; returns how many more times. ``BenchError`` where the chip cannot."""
-        ...
-
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
         """The data sheet's own; the instrument must rest. Ends configured and started as before."""
         ...

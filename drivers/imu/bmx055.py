@@ -238,26 +238,6 @@ class Bmx055:
         self._gyro.update_checked(m.GYR_OFFSET_LOW, (x & 0b11) << 2 | (y & 1) << 1 | z & 1)
         return self.read_offsets()
 
-    def persist_offsets(self, limit_s: float = 0.5) -> int:
-        """Burn the offsets of accelerometer and gyro into their non-volatile memory ("Non-volatile memory").
-
-        The number of times is limited (``nvm_remain``); the answer is the smaller one of what is left."""
-        dies = (
-            (self._accel, m.ACC_NVM_CTRL, m.ACC_NVM_REMAIN, m.ACC_NVM_READY),
-            (self._gyro, m.GYR_NVM_CTRL, m.GYR_NVM_REMAIN, m.GYR_NVM_READY),
-        )
-        for die, control, remain, _ in dies:
-            if remain.take(die.read(control)) == 0:
-                raise BenchError("the non-volatile memory has been written as often as it may be", device=die.name)
-        left: list[int] = []
-        for die, control, remain, ready in dies:
-            die.write(control, m.NVM_PROG_MODE)
-            die.write(control, m.NVM_PROG_MODE | m.NVM_PROG_TRIGGER)
-            die.await_field(ready, 1, limit_s, "writing the non-volatile memory")
-            die.write(control, 0)
-            left.append(remain.take(die.read(control)))
-        return min(left)
-
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
         """Accelerometer deflected both ways at 4 g, gyro's built-in test, magnetometer's normal self-test."""
         mode = self._mode

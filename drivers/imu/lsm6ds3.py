@@ -173,13 +173,6 @@ class Lsm6ds3(CountingImu):
         self._gyro_offset[:] = offsets.gyro_rad_s
         return offsets
 
-    def persist_offsets(self, limit_s: float = 0.5) -> int:
-        raise BenchError(
-            "an LSM6DS3 has no offset registers; keep the offsets in the calibration file and write them after "
-            "every reset",
-            device=self.name,
-        )
-
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
         """AN4650, self-test: accelerometer at 2 g and 52 Hz, gyro at 2000 deg/s and 208 Hz, positive direction."""
         mode = self._mode

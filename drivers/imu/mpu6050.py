@@ -179,13 +179,6 @@ class Mpu6050(CountingImu):
         self._chip.write_checked(m.XG_OFFS_USRH, *struct.pack(">3h", *gyro))
         return self.read_offsets()
 
-    def persist_offsets(self, limit_s: float = 0.5) -> int:
-        raise BenchError(
-            "the offset registers of an MPU-6050 are lost at reset and power-off; keep the offsets in the "
-            "calibration file and write them after every reset",
-            device=self.name,
-        )
-
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
         """Reaction to the built-in force against the factory's record of it (RM 4.1): 8 g, 250 deg/s."""
         mode = self._mode

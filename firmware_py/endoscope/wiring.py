@@ -51,12 +51,15 @@ class Card(Protocol):
 
 @dataclass
 class Sensor:
-    """Holds one source of inertial samples. ``imu`` is the chip's driver, ``card`` the card's; one of them is set."""
+    """Holds one source of inertial samples. ``imu`` is the chip's driver, ``card`` the card's; one of them is set.
+
+    ``drain_hz`` is 0 for a chip that is read sample by sample, else how often its FIFO is emptied."""
 
     name: str
     rate_hz: float
     imu: Imu | None = None
     card: Card | None = None
+    drain_hz: float = 0.0
     sample: ImuSample = field(default_factory=ImuSample)
 
     def read(self) -> Status:
@@ -94,17 +97,18 @@ class Sensors:
         """Begin to measure."""
         for sensor in self.by_name.values():
             if sensor.imu is not None:
-                sensor.imu.start()
+                sensor.imu.start("fifo" if sensor.drain_hz else "data ready")
 
     def close(self) -> None:
         while self.closers:
             self.closers.pop()()
 
 
-def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
+def open_sensors(bench: OpenBench, only: str | None = None, *, may_drain: bool = False) -> Sensors:
     """Make, probe, reset and configure every inertial sensor of the bench, or the one called ``only``.
 
-    Raises ``BenchError`` for a bench without one, ``OpenFailed`` with every device that did not answer.
+    ``may_drain``: the caller can empty a FIFO. Raises ``BenchError`` for a bench without such a sensor, ``OpenFailed``
+    with every device that did not answer.
     """
     where, description = str(bench.file.path), bench.file.description
     options = check_devices(description, where)
@@ -117,7 +121,7 @@ def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
     sensors = Sensors({}, probes.identities)
     for name, spec in found.items():
         if only in (None, name):
-            probes.probe(name, partial(_open, bench, name, spec, options[name], sensors))
+            probes.probe(name, partial(_open, bench, name, spec, options[name], sensors, may_drain))
     try:
         probes.raise_failures()
     except HalError:
@@ -128,17 +132,19 @@ def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
     return sensors
 
 
-def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors: Sensors) -> str:
+def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors: Sensors, may_drain: bool) -> str:
     """Open and probe one sensor and add it to ``sensors``. Return what it says of itself."""
     match option:
         case ImuOptions():
-            if option.mode != "data ready":
+            drain_hz = option.drain_hz if option.mode == "fifo" else 0.0
+            if drain_hz and not may_drain:
                 raise BenchError(
-                    f"{bench.file.path}: [device.{name}.mode] the loop reads sample by sample: 'data ready'"
+                    f"{bench.file.path}: [device.{name}.mode] the loop reads sample by sample, set it to 'data ready';"
+                    " 'fifo' is for micron imu"
                 )
             imu = open_imu(spec, option, bench.i2c(spec.bus or ""), bench.clock, name)
             identity = imu.probe()
-            sensors.by_name[name] = Sensor(name, imu.setup.rate_hz, imu=imu)
+            sensors.by_name[name] = Sensor(name, imu.setup.rate_hz, imu=imu, drain_hz=drain_hz)
             return identity
         case MotionCardOptions():
             card = MotionCard(

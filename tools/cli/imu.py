@@ -121,7 +121,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
         open_bench(described, pace=pace_of(virtual), runtime_dir=Path(folder)) as opened,
         Progress(*columns, console=console(), transient=True) as bar,
     ):
-        sensors = open_sensors(opened, only)
+        sensors = open_sensors(opened, only, may_drain=True)
         try:
             sensors.start()
             for name, device in sensors.by_name.items():

@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.base import wait_s
-from drivers.imu.base import ImuOffsets
+from drivers.imu.base import Imu, ImuBlock, ImuOffsets
 from firmware_py.endoscope.wiring import Sensor
 from hal.contracts import Clock
 from hal.types import STANDARD_GRAVITY, Status
@@ -21,11 +22,15 @@ from tools.imu.series import Series
 SETTLE_S, MEAN_S = 10.0, 10.0
 PATIENCE_S = 2.0
 Progress = Callable[[float], None]
+Array = NDArray[np.float64]
 
 
 def record(sensor: Sensor, clock: Clock, seconds: float, progress: Progress | None = None) -> Series:
-    """``seconds`` of samples, held back ones left out. ``InputError`` when the sensor falls silent for 2 s."""
+    """Record ``seconds`` of samples; repeated ones are left out. Raises ``InputError`` when the sensor is silent for 2
+    s."""
     n = max(1, round(seconds * sensor.rate_hz))
+    if sensor.imu is not None and sensor.drain_hz:
+        return _record_fifo(sensor, sensor.imu, clock, n, progress)
     accel, gyro, warm = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
     period_ns = round(1e9 / sensor.rate_hz)
     start_ns = last_ns = clock.now_ns()
@@ -39,12 +44,44 @@ def record(sensor: Sensor, clock: Clock, seconds: float, progress: Progress | No
             if progress is not None and got % 100 == 0:
                 progress(got / n)
         elif now_ns - last_ns > PATIENCE_S * 1e9:
-            raise InputError(f"{sensor.name}: no sample for {PATIENCE_S:g} s after {got} of {n}; check link and power")
+            raise InputError(_silent(sensor, got, n))
         if sample.seq == seen or sensor.card is None:
             # a chip is asked at its own rate, a card's queue is emptied first
             steps = max(1, math.ceil((clock.now_ns() - start_ns + 1) / period_ns))
             clock.sleep_until_ns(start_ns + steps * period_ns)
         seen = sample.seq
+    return _series(sensor, accel, gyro, warm, lost)
+
+
+def _record_fifo(sensor: Sensor, imu: Imu, clock: Clock, n: int, progress: Progress | None) -> Series:
+    """Record ``n`` samples from the chip's FIFO, which is emptied ``drain_hz`` times a second."""
+    block = ImuBlock()
+    while imu.read_fifo(block) == block.capacity:  # samples from before the call
+        pass
+    accel, gyro, warm = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
+    period_ns = round(1e9 / sensor.drain_hz)
+    last_ns, due_ns, got, lost = clock.now_ns(), clock.now_ns(), 0, sensor.lost
+    while got < n:
+        due_ns = max(due_ns + period_ns, clock.now_ns())
+        clock.sleep_until_ns(due_ns)
+        k = min(imu.read_fifo(block), n - got)
+        new = slice(got, got + k)
+        accel[new], gyro[new], warm[new] = block.accel_mps2[:k], block.gyro_rad_s[:k], block.temperature_C
+        got += k
+        last_ns = clock.now_ns() if k else last_ns
+        if clock.now_ns() - last_ns > PATIENCE_S * 1e9:
+            raise InputError(_silent(sensor, got, n))
+        if progress is not None:
+            progress(got / n)
+    return _series(sensor, accel, gyro, warm, lost)
+
+
+def _silent(sensor: Sensor, got: int, n: int) -> str:
+    return f"{sensor.name}: no sample for {PATIENCE_S:g} s after {got} of {n}; check link and power"
+
+
+def _series(sensor: Sensor, accel: Array, gyro: Array, warm: Array, lost: int) -> Series:
+    """Return the samples in g and deg/s; ``lost`` is the sensor's count of lost samples when the recording began."""
     temperature = warm if np.all(np.isfinite(warm)) else None
     return Series(
         sensor.name, sensor.rate_hz, accel / STANDARD_GRAVITY, np.degrees(gyro), temperature, sensor.lost - lost
@@ -94,7 +131,7 @@ def auto_calibrate(
     """Settle, average, write minus the offset into the chip's registers, read back, measure again.
 
     The sensor lies motionless with one axis vertical. ``InputError`` when it moves, or has no registers to write (a
-    card calibrates itself). The registers keep what is written until reset, or for good where the chip can persist.
+    card calibrates itself). The registers keep what is written until reset.
     """
     imu = sensor.imu
     if imu is None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from firmware_py.endoscope.wiring import open_sensors
 from hal.bench import load_bench, open_bench
+from hal.errors import BenchError
 from tools.cli.main import app
 from tools.errors import InputError
 from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_still, evaluate_turned
@@ -216,12 +217,13 @@ gyro_range_dps = 2000.0
 """
 
 
+@pytest.mark.parametrize("mode", ["data ready", "fifo"])
 @pytest.mark.parametrize("driver", list(CHIPS))
-def test_auto_calibration_in_the_registers_of_each_chip(driver: str, tmp_path: Path) -> None:
+def test_auto_calibration_in_the_registers_of_each_chip(driver: str, mode: str, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
-    path.write_text(BENCH.format(driver=driver, address=CHIPS[driver]))
+    path.write_text(BENCH.format(driver=driver, address=f'{CHIPS[driver]}\nmode = "{mode}"'))
     with open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path) as opened:
-        sensors = open_sensors(opened)
+        sensors = open_sensors(opened, may_drain=True)
         sensors.start()
         chip = sensors.by_name["chip"]
         result = auto_calibrate(chip, opened.clock, settle_s=0.5, mean_s=3.0)
@@ -234,6 +236,16 @@ def test_auto_calibration_in_the_registers_of_each_chip(driver: str, tmp_path: P
         assert after.seconds == pytest.approx(2.0, abs=0.02)
         assert after.lost == 0
         assert simple(after) == pytest.approx(result.left_g, abs=0.001)
+
+
+def test_a_loop_that_reads_sample_by_sample_refuses_a_fifo(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(BENCH.format(driver="lsm6ds3", address=CHIPS["lsm6ds3"] + '\nmode = "fifo"'))
+    with (
+        open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path) as opened,
+        pytest.raises(BenchError, match="'fifo' is for micron imu"),
+    ):
+        open_sensors(opened)
 
 
 # -- the command ------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ CALLED = [
     "doctor", "emulate", "simulate_command", "curved", "legendre", "loop_with_speed",
     # by users: notebooks, tests of other projects, writers of drivers and twins
     "open_run", "to_dataframe", "to_html", "smbus", "write_quick", "read_byte*", "write_byte*", "read_word_data",
-    "write_word_data", "read_fifo", "persist_offsets", "UserTwin",
+    "write_word_data", "UserTwin",
 ]  # fmt: skip
 
 

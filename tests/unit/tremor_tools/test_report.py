@@ -104,6 +104,10 @@ def test_train_command_writes_weights_that_run(tmp_path: Path) -> None:
     network = load_network(out)
     assert network.centred
     assert np.all(np.isfinite(Cascade(network).run(np.zeros(100))))
+    again = tmp_path / "again.json"
+    tested = CliRunner().invoke(app, ["tremor", "train", str(file), "--weights", str(out), "--json", str(again)])
+    assert tested.exit_code == 0, tested.output
+    assert json.loads(again.read_text())["rows"][0]["percent"] > 60.0
 
 
 @pytest.mark.parametrize("extra", [["--leave-out", "nobody"], ["--window", "400", "--spacing", "20"]])

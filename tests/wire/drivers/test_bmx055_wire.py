@@ -249,30 +249,6 @@ def test_offset_beyond_one_g_is_refused_before_anything_is_written():
         imu.write_offsets(ImuOffsets(accel_mps2=(0.0, 0.0, 132 * G / 128)))
 
 
-def test_offsets_are_burnt_and_the_rest_counted():
-    def burn(die: int, before: str, after: str) -> list[Step]:
-        # 0x33: unlock, trigger, wait for nvm_rdy (bit 2), lock
-        return [w(die, "33 01"), w(die, "33 03"), r(die, "33", before), r(die, "33", after), w(die, "33 00")]
-
-    imu, bus, _ = make(
-        r(ACC, "33", "f4"),
-        r(GYR, "33", "84"),
-        *burn(ACC, "f1", "e5"),
-        r(ACC, "33", "e4"),
-        *burn(GYR, "81", "75"),
-        r(GYR, "33", "74"),
-    )
-    assert imu.persist_offsets() == 7
-    bus.done()
-
-
-def test_worn_out_memory_is_not_written():
-    imu, bus, _ = make(r(ACC, "33", "f4"), r(GYR, "33", "04"))
-    with pytest.raises(BenchError, match="imu gyro: the non-volatile memory"):
-        imu.persist_offsets()
-    bus.done()
-
-
 def test_self_test_of_three_dies():
     def deflected(test: str, counts_xyz: tuple[int, int, int]) -> list[Step]:
         data = struct.pack("<3h", *(c << 4 for c in counts_xyz)).hex()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.table import Table
@@ -13,12 +13,19 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
+if TYPE_CHECKING:
+    from tools.research.tremor.cascade_data import Subject
+    from tools.research.tremor.cascade_training import Array
+
 
 def train(
     recordings: Annotated[
         list[str], typer.Argument(metavar="RECORDING[#NAME]...", help="Gyroscope recordings of hands.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="File for the weights (JSON).")] = Path("out/cascade.json"),
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Test the network of this file instead of training one.")
+    ] = None,
     leave_out: Annotated[
         list[str] | None, typer.Option(metavar="PERSON", help="Subject that is held out for the test; may be repeated.")
     ] = None,
@@ -39,7 +46,7 @@ def train(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     json_file: JsonOption = None,
 ) -> None:
-    """Train on one file of each person, test on the others' files, write the weights.
+    """Train a cascade network on one file of each person, test it on the other files, write its weights.
 
     Example: micron tremor train ../shared/data/tremor_mouse_lsm9ds1 --leave-out mouse23 --out out/cascade.json
     """
@@ -56,6 +63,9 @@ def train(
         if not signals:
             raise InputError(f"{', '.join(recordings)}: no gyroscope recording; training integrates angular rate once")
         people = subjects(signals, making)
+        if weights is not None:
+            _test(weights, people, voluntary(making, TEST_SEED), json_file)
+            return
         known = [p.name for p in people]
         for name in leave_out or []:
             if name not in known:
@@ -106,3 +116,20 @@ def train(
             },
             json_file,
         )
+
+
+def _test(weights: Path, people: list[Subject], wanted: Array, json_file: str | None) -> None:
+    """Print how much of the error the network of ``weights`` takes from each person's files."""
+    from tools.research.tremor.cascade_file import load_network
+    from tools.research.tremor.cascade_study import mean_percent, score
+
+    network = load_network(weights)
+    table = Table("person", "files tested", "less rms error (%)", title=network.note)
+    rows: list[dict[str, object]] = []
+    for person in people:
+        percent = mean_percent([score(network, e, wanted) for e in person.errors])
+        rows.append({"person": person.name, "files": len(person.errors), "percent": percent})
+        table.add_row(person.name, str(len(person.errors)), f"{percent:.1f}")
+    if json_file != "-":
+        data_console().print(table)
+    write_json({"format": 1, "weights": str(weights), "rows": rows}, json_file)
