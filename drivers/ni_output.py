@@ -41,7 +41,9 @@ class NidaqmxOutput(GuardedOutput):
     ) -> None:
         if not lo_V <= neutral_V <= hi_V or max(abs(lo_V), abs(hi_V)) / gain > 10.0:
             raise BenchError(
-                f"{lo_V} <= {neutral_V} <= {hi_V} V within +-10 V x gain {gain} does not hold", device=name
+                f"lo_V = {lo_V}, neutral_V = {neutral_V}, hi_V = {hi_V}: they must rise"
+                f" and lie within +-{10 * gain:g} V (gain {gain:g})",
+                device=name,
             )
         self.name = name
         self.limits = (OutputLimit(lo_V, hi_V, slew_V_per_s, neutral_V),) * len(channels)

@@ -62,9 +62,9 @@ def parse_injection(text: str) -> Injection:
             raise BenchError(f"--inject {text!r}: {item!r} is not KEY=VALUE with one of {', '.join(KEYS)}")
         number = _number(text, key, value)
         if not (number >= 0.0 and (key not in PROBABILITIES or number <= 1.0)):
-            raise BenchError(f"--inject {text!r}: {key} is {'0 to 1' if key in PROBABILITIES else '0 or more'}")
+            raise BenchError(f"--inject {text!r}: {key} must be {'0 to 1' if key in PROBABILITIES else '0 or more'}")
         if math.isinf(number) and key not in FOR_EVER:
-            raise BenchError(f"--inject {text!r}: {key} is a finite number")
+            raise BenchError(f"--inject {text!r}: {key} must be a finite number")
         values[key] = int(number) if key == "seed" else number
     return Injection(bus, FaultPlan(**values), _address(text, address) if at else None)
 

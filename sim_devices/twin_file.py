@@ -106,7 +106,7 @@ def load_twin(path: Path) -> FileTwin:
     except tomllib.TOMLDecodeError as error:
         raise BenchError(f"{path}: {error}") from error
     if not isinstance(table, Mapping) or table.get("kind") not in KINDS:
-        raise BenchError(f"{path}: no [twin] of a kind that can be run here: {', '.join(KINDS)}")
+        raise BenchError(f"{path}: no [twin] that a bench can run; its kind must be one of {', '.join(KINDS)}")
     entries = table.get("effects", [])
     if not isinstance(entries, list):
         raise BenchError(f"{path}: [[twin.effects]] must be tables")

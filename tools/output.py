@@ -159,7 +159,7 @@ def check_folder(folder: Path | None, option: str = "--out") -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{option} {folder}: is a file; name a folder")
     if folder.exists() and not os.access(folder, os.W_OK):
-        raise InputError(f"{option} {folder}: is not writable")
+        raise InputError(f"{option} {folder}: you may not write there; name another folder, or change its rights")
 
 
 def _cannot(path: object, error: OSError) -> str:

@@ -73,7 +73,7 @@ def named_in(path: Path) -> list[Named]:
     Raises InputError when there is nothing at ``path``. What cannot be read is left to the command that uses it.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+        raise InputError(f"{path}: there is no such file or folder; name a recording, twin, bench, .py or .fmu")
     found: dict[str, Named] = {}
     seen: set[Path] = set()
     todo = [path]

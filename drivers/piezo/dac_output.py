@@ -83,7 +83,8 @@ class DacOutput(GuardedOutput):
             raise BenchError(f"address 0x{address:02X} is not one of 0x{first:02X}..0x{last:02X}", device=name)
         if not (0.0 <= lo_V <= neutral_V <= hi_V <= full_V and neutral_V < full_V):
             raise BenchError(
-                f"0 <= lo_V = {lo_V} <= neutral_V = {neutral_V} <= hi_V = {hi_V} <= {full_V} V does not hold",
+                f"lo_V = {lo_V}, neutral_V = {neutral_V}, hi_V = {hi_V}: they must rise"
+                f" and lie within 0 .. {full_V:g} V",
                 device=name,
             )
         self.name = name

@@ -91,7 +91,10 @@ class E727(GuardedOutput):
             low, high = self.link.values("TMN?", CHANNELS), self.link.values("TMX?", CHANNELS)
             limit = self.limits[0]
             if max(low) > limit.lo_V * self.per_V or min(high) < limit.hi_V * self.per_V:
-                raise BenchError(f"the stage travels {low} .. {high} um, less than commanded", device=self.name)
+                raise BenchError(
+                    f"the stage travels {low} .. {high} um, less than lo_V .. hi_V command; narrow these",
+                    device=self.name,
+                )
         return identity
 
     def arming(self) -> Iterator[None]:

@@ -109,13 +109,13 @@ def _address(table: dict[str, Any], part: str) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int) or not 0x08 <= value <= 0x77:
-        raise InputError(f"{part}: an I2C address is 0x08 to 0x77")
+        raise InputError(f"{part}: {value!r} is no I2C address; choose one from 0x08 to 0x77")
     return value
 
 
 def _inputs(given: Any) -> dict[str, int]:
     if not isinstance(given, dict):
-        raise InputError("say which input is which axis")
+        raise InputError("inputs: choose for each axis the input of the converter that it is wired to")
     inputs: dict[str, int] = {}
     for place in PLACES:
         value = given.get(place)

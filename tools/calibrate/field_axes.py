@@ -42,7 +42,8 @@ def fit_turn(field: Array, force: Array) -> BodyTurn:
     still = np.abs(size - np.median(size)) < STILL * np.median(size)
     if np.sum(still) < LEAST_POSES:
         raise InputError(
-            f"{int(np.sum(still))} samples at rest: {LEAST_POSES} attitudes are needed for the body's turn"
+            f"{int(np.sum(still))} samples at rest; the turn of the body needs {LEAST_POSES}."
+            " Hold the instrument still in more attitudes"
         )
     up, m = force[still] / size[still, None], field[still]
     m = m / np.median(np.linalg.norm(m, axis=1))
@@ -55,7 +56,10 @@ def fit_turn(field: Array, force: Array) -> BodyTurn:
     jacobian = _slope(residual, fit.x)
     condition = float(np.linalg.cond(jacobian / np.linalg.norm(jacobian, axis=0)))
     if condition > LARGEST_CONDITION:
-        raise InputError(f"condition number {condition:.0f}: turn the body through all directions, about all axes")
+        raise InputError(
+            f"the attitudes do not fix all three axes (condition number {condition:.0f});"
+            " turn the body through all directions, about all axes"
+        )
     left = residual(fit.x)
     scale = 1.4826 * float(np.median(np.abs(left)))
     spread = scale * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))

@@ -140,7 +140,10 @@ def fit_gyroscope(
     fit = least_squares(residual, np.concatenate([np.zeros(6), np.ones(3)]), method="lm", x_scale="jac")
     condition = float(np.linalg.cond(fit.jac / np.linalg.norm(fit.jac, axis=0)))
     if condition > LARGEST_CONDITION:
-        raise InputError(f"condition number {condition:.0f}: turn about all three axes, in both directions")
+        raise InputError(
+            f"the turns do not fix all three axes (condition number {condition:.0f});"
+            " turn about each of them, in both directions"
+        )
     freedom = max(1, 2 * len(start) - 9)  # a direction has two angles
     sigma2 = float(fit.fun @ fit.fun) / freedom
     reach = float(student.ppf(0.975, freedom)) * unit * np.sqrt(np.diag(sigma2 * np.linalg.pinv(fit.jac.T @ fit.jac)))

@@ -75,7 +75,10 @@ def instrument_readings(log: SensorLog, config: SensingConfig) -> tuple[Array, A
             frame, smoothed = LAYOUT.new_frame(), np.full(2, np.nan)
             bad = calibrate_rows(counts, volts, calibration_params(config), smoothed, frame, (readings, field))
             if bad >= 0:
-                raise InputError(f"{log.path}: sample {bad}: the supply is missing (input {config.supply_channel})")
+                raise InputError(
+                    f"{log.path}: the supply (input {config.supply_channel}) of sample {bad} is no positive voltage;"
+                    " cut the log there, or check the wiring of this input"
+                )
             return readings, field
     names = reading_names(len(config.channels))
     if names[0] not in log.columns:

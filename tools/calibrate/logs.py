@@ -69,7 +69,7 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
     units = {str(c["column"]): str(c["unit"]) for c in channels if "unit" in c}
     names = column_names(file)
     if not names:
-        raise InputError(f"{file}: holds no columns of numbers")
+        raise InputError(f"{file}: no columns of numbers; a log needs a line of names and lines of numbers below it")
     columns = read_columns(file, names)
     units = {**column_units(file), **units}
     named = meta.get("time_column")
@@ -79,11 +79,15 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
     gaps = 0
     if time is not None:
         if time not in columns:
-            raise InputError(f"{descriptor}: time_column '{time}' is no column of {file}")
+            raise InputError(
+                f"{descriptor}: time_column '{time}' is no column of {file}; it has {', '.join(list(columns)[:8])}"
+            )
         step = np.diff(columns[time])
         if len(step) == 0 or not np.all(np.isfinite(step)) or np.min(step) <= 0.0:
             where = int(np.argmin(np.where(np.isfinite(step), step, -np.inf))) if len(step) else 0
-            raise InputError(f"{file}: time column '{time}' does not run forward at sample {where + 1}")
+            raise InputError(
+                f"{file}: time column '{time}' does not run forward at sample {where + 1}; sort the log or cut it"
+            )
         usual = float(np.median(step))
         gaps = int(np.sum(step > LOST * usual))
         rate_hz = rate_hz or 1.0 / usual

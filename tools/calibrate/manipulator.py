@@ -57,12 +57,17 @@ def load_scan(folder: Path) -> dict[str, Array]:
         ) from error
     for name in ("stroke_um", "tip_um"):
         if name not in data or data[name].ndim != 2 or data[name].shape[1] != 3:
-            raise InputError(f"{path}: array '{name}' (n, 3) is missing or has another shape")
+            raise InputError(
+                f"{path}: array '{name}' is missing or is not (n, 3); it needs a row of three numbers per position"
+            )
         if not np.all(np.isfinite(data[name])):
             row = int(np.argwhere(~np.isfinite(data[name]))[0][0])
             raise InputError(f"{path}: '{name}' is not finite at position {row}")
     if len(data["tip_um"]) != len(data["stroke_um"]):
-        raise InputError(f"{path}: {len(data['stroke_um'])} strokes but {len(data['tip_um'])} tip positions")
+        raise InputError(
+            f"{path}: {len(data['stroke_um'])} rows of strokes and {len(data['tip_um'])} tip positions; each row"
+            " needs the tip position that was measured with it"
+        )
     return data
 
 

@@ -55,7 +55,7 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
 def _identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not given:
-        raise InputError("no recording was given")
+        raise InputError("no recording was given; name at least one folder with a recording of the stack")
     steps = [r for r in given if is_steps(r)]
     given = [r for r in given if not is_steps(r)]
     if not given:

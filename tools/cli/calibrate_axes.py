@@ -50,7 +50,7 @@ def three(columns: str) -> tuple[str, str, str]:
     """Return the three names in one option, or raise ``InputError``."""
     names = tuple(name.strip() for name in columns.split(","))
     if len(names) != 3:
-        raise InputError(f"--columns {columns}: three names are needed")
+        raise InputError(f"--columns {columns}: give three names with commas between, for x, y and z")
     return names  # pyright: ignore[reportReturnType]
 
 

@@ -43,7 +43,7 @@ class PolicyChoice(StrEnum):
 
 def _ask(question: str, yes: bool) -> None:
     if not yes and not typer.confirm(question, err=True):
-        raise InputError("nothing was done")
+        raise InputError("you did not agree, so nothing was done; --yes agrees beforehand")
 
 
 def scan(
@@ -288,7 +288,7 @@ def dump(
         path = bench_path(bench)
         buses = [name for name, spec in load_bench(path).description.bus.items() if spec.kind == "can"]
         if not buses:
-            raise InputError(f"{path}: this bench has no CAN bus")
+            raise InputError(f"{path}: this bench has no CAN bus; name one that has with --bench")
         heard = []
         with opened_bench(path, pace=pace_of(virtual)) as opened, keep_what_is_there():
             for one in listen(opened, buses, seconds, count):

@@ -343,7 +343,9 @@ def apply(
         body = read_report(report)
         twin = corrected_twin(recording, body)
         if original is not None and twin.kind != "piezo_stack":
-            raise InputError(f"{bench}: an emulated bench runs twins of piezo_stack, this one is a {twin.kind}")
+            raise InputError(
+                f"{bench}: a bench runs twins of kind piezo_stack, and this one is a {twin.kind}; leave --bench out"
+            )
         write_twin(twin, body, out)
         for note in twin.notes:
             print_note(note)

@@ -64,7 +64,10 @@ def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
     amplifier = options[only(DacAmplifierOptions, "dac_amplifier")]
     tick_hz = bench.description.clock.tick_hz
     if tick_hz != 1000 or daq.rate_hz != tick_hz or tuple(daq.channels) != tuple(range(8)):
-        raise InputError(f"{where}: a run without wires ticks at 1000 Hz and scans channels 0 to 7 in order")
+        raise InputError(
+            f"{where}: without wires the tick and the DAQ are at 1000 Hz and channels are 0 to 7 in order; use"
+            " micron run --virtual for this bench"
+        )
     if not 0.0 <= delay_s < STEPS_PER_MS * STEP_S:
         raise InputError(f"a delay of {1e3 * delay_s:g} ms: it is 0 or more and less than a tick of 1 ms")
     steps, rest_s = divmod(delay_s, STEP_S)
@@ -124,7 +127,7 @@ def simulate(
         table["emulation"]["seed"] = seed
     emulation = emulation_config(table)
     if emulation.endoscope is not None:
-        raise InputError(f"{bench.path}: an endoscope bench has no closed loop")
+        raise InputError(f"{bench.path}: an endoscope has no closed loop against tremor; use micron run --bench FILE")
     plan = load_plan(bench, method)
     configs = plan.stages
     watch = round(plan.firmware.self_test.watch_ms)

@@ -42,7 +42,7 @@ def read_stimulus(text: str) -> Stimulus:
     if rate is not None:
         rate_hz = _number(rate)
         if not 0.0 < rate_hz < 1e7:
-            raise InputError(f"--stimulus {text}: {rate} is not a rate in Hz")
+            raise InputError(f"--stimulus {text}: {rate} is not a rate in Hz above 0")
         t_s = np.arange(len(values)) / rate_hz
     else:
         name = next(name for name in TIMES if name in columns)

@@ -92,7 +92,7 @@ def serve(
     """
     description = bench.description
     if description.emulation.get("provider", PROVIDER) != PROVIDER:
-        raise InputError(f"{bench.path}: [emulation.provider] is not {PROVIDER}, the only one that can be served")
+        raise InputError(f"{bench.path}: [emulation.provider] must be '{PROVIDER}' here; micron run runs other ones")
     emulated = description.emulated_buses()
     if not emulated:
         raise InputError(f"{bench.path}: no bus is emulated; give a bus the URI sim://NAME")

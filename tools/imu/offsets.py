@@ -46,7 +46,9 @@ def manual(series: Series) -> ManualOffset:
     smooth = np.stack([np.convolve(accel[:, i], np.full(window, 1.0 / window), "same") for i in range(3)], axis=1)
     smooth = smooth[window:-window][calm[window:-window]]
     if len(smooth) < window:
-        raise InputError(f"{series.name}: the sensor was never led slowly enough to feel gravity alone")
+        raise InputError(
+            f"{series.name}: the sensor never turned slowly enough to measure gravity alone; take 5 s a turn"
+        )
     top, bottom = smooth.max(axis=0), smooth.min(axis=0)
     reach = float(np.max(top - bottom)) / 2.0
     missing = [f"+{a}" for a, v in zip(AXES, top, strict=True) if v < UPRIGHT * reach - 0.1]
@@ -66,7 +68,7 @@ def simple(series: Series) -> Array:
 def gyroscope_mean(series: Series) -> Array:
     """Return the mean (3,) in deg/s while motionless (5.3.1). Raises ``InputError`` without a gyroscope."""
     if series.gyro_dps is None:
-        raise InputError(f"{series.name}: no gyroscope columns gyro_x_UNIT ...")
+        raise InputError(f"{series.name}: no gyroscope; name its columns gyro_x_deg_s or gyro_x_rad_s, and y, z")
     return series.gyro_dps.mean(axis=0)
 
 

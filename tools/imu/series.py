@@ -99,12 +99,17 @@ def join_series(parts: list[Series]) -> Series:
     first = parts[0]
     for other in parts[1:]:
         if other.rate_hz != first.rate_hz:
-            raise InputError(f"{other.name}: {other.rate_hz:g} Hz, but {first.name} has {first.rate_hz:g} Hz")
+            raise InputError(
+                f"{other.name}: {other.rate_hz:g} Hz, and {first.name} {first.rate_hz:g} Hz: give one rate"
+            )
 
     def stack(columns: list[Array | None]) -> Array | None:
         present = [c for c in columns if c is not None]
         if len(present) not in (0, len(parts)):
-            raise InputError(f"{', '.join(p.name for p in parts)}: not all of them have the same columns")
+            raise InputError(
+                f"{', '.join(p.name for p in parts)}: the files do not have the same columns;"
+                " give recordings of one sensor and one format"
+            )
         return np.concatenate(present) if present else None
 
     return Series(

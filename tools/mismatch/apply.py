@@ -57,7 +57,7 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
     try:
         model, theta = restore(with_effects)
     except RecordingError as error:
-        raise InputError(f"the report does not fit the recording: {error}") from error
+        raise InputError(f"the report does not fit the recording: {error}; diagnose the recording again") from error
     theta = _same_weight(recording, report, model, theta)
     table = describe(model, theta)
     head = (
@@ -82,11 +82,13 @@ def _physics(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
         raise InputError(f"the report has no {', '.join(missing)}; give the whole JSON that diagnose wrote")
     found = report["physics"]
     if not isinstance(found, list) or not isinstance(report["corrected_base"], Mapping):
-        raise InputError("the report's physics or corrected_base is not what diagnose writes")
+        raise InputError(
+            "the report was changed by hand: its physics or corrected_base has another form; run diagnose --json again"
+        )
     for i, p in enumerate(found):
         where = f"the report's physics {i + 1}"
         if not isinstance(p, Mapping) or not isinstance(p.get("name"), str):
-            raise InputError(f"{where} has no name")
+            raise InputError(f"{where} has no name; give the JSON that diagnose wrote")
         if p["name"] not in EFFECTS:
             raise InputError(f"{where}: '{p['name']}' is not in the vocabulary; see 'micron mismatch physics'")
         absent = [k for k in ("site", "target", "stage", "outputs", "settings", "raw") if k not in p]
@@ -104,12 +106,18 @@ def check_report(recording: Recording, report: Mapping[str, Any]) -> None:
 def check_outputs(recording: Recording, report: Mapping[str, Any]) -> None:
     """Raise InputError if twin or outputs of a report are not those of a recording."""
     if report["twin"] != recording.twin.kind:
-        raise InputError(f"the report is of a {report['twin']}, {recording.path} of a {recording.twin.kind}")
+        raise InputError(
+            f"the report is of a {report['twin']} and {recording.path} of a {recording.twin.kind};"
+            " give the report of this recording"
+        )
     fit = report["fit"]
     outputs = set(fit.get("unit", {})) if isinstance(fit, Mapping) else set[str]()
     if outputs != set(recording.outputs):
         reported, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
-        raise InputError(f"the report's outputs ({reported}) are not those of {recording.path} ({have})")
+        raise InputError(
+            f"the report's outputs ({reported}) are not those of {recording.path} ({have});"
+            " give the report of this recording"
+        )
 
 
 def report_effects(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -155,4 +163,4 @@ def _require_finite(value: Any) -> None:
     for inner in value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ():
         _require_finite(inner)
     if isinstance(value, float) and not math.isfinite(value):
-        raise InputError(f"the report holds {value}, which no twin can use")
+        raise InputError(f"the report holds {value}, which no twin can use; diagnose the recording again")

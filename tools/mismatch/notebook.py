@@ -280,7 +280,9 @@ class Diagnosis:
         """
         p = self.report.pictures
         if p is None:
-            raise InputError("this report carries no courses")
+            raise InputError(
+                "this report carries no courses, as one that was read from JSON; diagnose the recording again"
+            )
         columns: dict[str, Any] = dict(p.signals)
         for output in p.measured:
             kinds = (

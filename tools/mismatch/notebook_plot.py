@@ -45,7 +45,9 @@ def plot_report(report: Report, output: str | None = None) -> Figure:
     """Draw an output of a report: the courses, and the residuals below them. Raises ``InputError``."""
     p, fit = report.pictures, report.fit
     if p is None:
-        raise InputError("this report carries no courses to draw")
+        raise InputError(
+            "this report carries no courses to draw, as one that was read from JSON; diagnose the recording again"
+        )
     order = sorted(fit.unit, key=lambda o: -fit.recalibrated_rms[o] / max(fit.noise_floor_rms[o], 1e-300))
     chosen = output or order[0]
     if chosen not in fit.unit:

@@ -63,7 +63,9 @@ def read_channels(
                 f"{at}: signal '{signal}' is already taken by [[channels]] {signals[signal]}; one column per signal"
             )
         if column in columns:
-            raise RecordingError(f"{at}: column '{column}' is already used by [[channels]] {columns[column]}")
+            raise RecordingError(
+                f"{at}: column '{column}' is already used by [[channels]] {columns[column]}; name another column"
+            )
         signals[signal], columns[column] = i + 1, i + 1
         allowed = words.units(role, signal)
         if allowed is None:
@@ -79,9 +81,11 @@ def read_channels(
             tolerance = None
         out.append(Channel(column, role, signal, unit, to, noise, step, tolerance))
     if not any(c.role == "output" for c in out):
-        raise RecordingError(f"{where}: no channel with role = 'output': there is nothing to compare the twin with")
+        raise RecordingError(
+            f"{where}: no channel has role = 'output'; set it for the column that the twin is compared with"
+        )
     if not any(c.role == "input" for c in out):
-        raise RecordingError(f"{where}: no channel with role = 'input': the twin has nothing to run on")
+        raise RecordingError(f"{where}: no channel has role = 'input'; set it for the column that drives the twin")
     _together(where, kind, out)
     return out
 
@@ -124,14 +128,19 @@ def _together(where: str, kind: str, channels: list[Channel]) -> None:
     if kind == "accelerometer_cluster":
         for o in outputs:
             if f"specific_force_{o[-1]}" not in inputs:
-                raise RecordingError(f"{where}: output '{o}' needs the input 'specific_force_{o[-1]}'")
+                raise RecordingError(
+                    f"{where}: output '{o}' needs the input 'specific_force_{o[-1]}'; add it or drop {o}"
+                )
     if kind == "mechanical_axis":
         if len(inputs) > 1:
-            raise RecordingError(f"{where}: mechanical_axis takes force or torque, not both")
+            raise RecordingError(f"{where}: a mechanical_axis takes a force or a torque; drop one of the two inputs")
         angular = "torque" in inputs
         for o, c in outputs.items():
             if ("rad" in c.to) != angular:
-                raise RecordingError(f"{where}: {o} in {c.to} does not go with the input {', '.join(inputs)}")
+                raise RecordingError(
+                    f"{where}: output {o} in {c.to} does not go with the input {', '.join(inputs)};"
+                    " a force moves metres, a torque radians"
+                )
 
 
 def converted(data_path: Path, c: Channel, column: Array, notes: list[str]) -> Array:

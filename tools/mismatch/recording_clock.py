@@ -63,7 +63,9 @@ def time_step(path: Path, name: str, stamps: Array, rate: float | None, notes: l
     elif off.max() > 0.01 * dt:
         notes.append(f"time stamps scatter by up to {off.max() / dt:.2g} of a step; taken as uniform")
     if rate is not None and abs(rate * dt - 1) > 0.2:
-        raise RecordingError(f"{path}: rate_hz {rate:g} contradicts the time column '{name}' ({1 / dt:g} Hz)")
+        raise RecordingError(
+            f"{path}: rate_hz {rate:g} contradicts the time column '{name}' ({1 / dt:g} Hz); leave one of them out"
+        )
     if rate is not None and abs(rate * dt - 1) > 1e-3:
         notes.append(f"rate_hz {rate:g} differs from the time column ({1 / dt:.6g} Hz); the time column is used")
     return dt, grid

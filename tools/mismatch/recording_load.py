@@ -192,7 +192,7 @@ def _twin_table(path: Path, value: object) -> object:
         raise RecordingError(f"{path}: [twin] file must be the name of a twin file, and stand alone")
     other = path_inside(path, name)
     if not other.is_file():
-        raise RecordingError(f"{path}: [twin] file: {other} does not exist")
+        raise RecordingError(f"{path}: [twin] file: {other} does not exist; name it relative to the recording")
     table = _toml(other).get("twin")
     if not isinstance(table, Mapping):
         raise RecordingError(f"{other}: no [twin] table; write one with 'micron mismatch apply'")

@@ -31,7 +31,7 @@ def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initializat
             raise RecordingError(f"{path}: [split] {key} names this recording itself; give a range of samples")
     fit, test = found.get("fit"), found.get("test")
     if isinstance(fit, tuple) and isinstance(test, tuple) and fit[0] < test[1] and test[0] < fit[1]:
-        raise RecordingError(f"{path}: [split] fit {list(fit)} and test {list(test)} share samples")
+        raise RecordingError(f"{path}: [split] fit {list(fit)} and test {list(test)} share samples; move one of them")
 
 
 def read_segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> tuple[int, ...]:

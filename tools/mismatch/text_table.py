@@ -70,7 +70,7 @@ class TextTable:
                 raise RecordingError(f"{self.path}: line 1: column '{name}' appears twice; rename one")
         use = [self.names.index(name) for name in names]
         if not self.samples:
-            raise RecordingError(f"{self.path}: a header and no samples")
+            raise RecordingError(f"{self.path}: no line of numbers below the header; is the file complete?")
         with _opened(self.path, self.encoding) as file:
             for _ in itertools.islice(file, self.first - 1):
                 pass

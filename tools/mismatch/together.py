@@ -63,16 +63,23 @@ def _check_alike(first: Recording, other: Recording) -> None:
     """Refuse two recordings of different systems; the message names both files and the difference."""
     both = f"{first.path} and {other.path} cannot be diagnosed together"
     if first.twin.kind != other.twin.kind:
-        raise RecordingError(f"{both}: the twin of one is {first.twin.kind}, of the other {other.twin.kind}")
+        raise RecordingError(
+            f"{both}: the twin of one is {first.twin.kind}, of the other {other.twin.kind}; give both the same [twin]"
+        )
     if first.twin.kind not in APART:
         raise RecordingError(f"{first.path}: a twin of kind '{first.twin.kind}' runs through; diagnose each by itself")
     for kind in ("inputs", "outputs", "context"):
         a, b = set(getattr(first, kind)), set(getattr(other, kind))
         if a != b:
-            raise RecordingError(f"{both}: only one of them has the {kind.rstrip('s')} {', '.join(sorted(a ^ b))}")
+            raise RecordingError(
+                f"{both}: only one of them has the {kind.rstrip('s')} {', '.join(sorted(a ^ b))};"
+                " give both the same channels"
+            )
     for signal, unit in first.unit.items():
         if other.unit[signal] != unit:
-            raise RecordingError(f"{both}: '{signal}' is in {unit} in one and in {other.unit[signal]} in the other")
+            raise RecordingError(
+                f"{both}: '{signal}' is in {unit} in one and in {other.unit[signal]} in the other; name one"
+            )
         if other.file_unit[signal] != first.file_unit[signal]:
             raise RecordingError(
                 f"{both}: '{signal}' is in {first.file_unit[signal]} in one file and in {other.file_unit[signal]}"

@@ -122,7 +122,7 @@ def parse(text: str) -> Unit:
     for side, group in enumerate(sides):
         terms = [w for w in re.split(r"[\s*·]+", group.strip().strip("()")) if w]
         if not terms:
-            raise UnitError(f"unit '{text}' has an empty part")
+            raise UnitError(f"unit '{text}' has an empty part; write it like m/s^2 or N m")
         for term in terms:
             match = _TERM.match(term)
             if match is None:

@@ -42,12 +42,12 @@ def test_a_plan_is_read_as_it_is_written():
     [
         ("daq0", "not understood"),
         ("daq0:los=1", "'los=1' is not KEY=VALUE"),
-        ("daq0:loss=2", "loss is 0 to 1"),
-        ("daq0:loss=nan", "loss is 0 to 1"),
-        ("daq0:delay_s=-1", "delay_s is 0 or more"),
+        ("daq0:loss=2", "loss must be 0 to 1"),
+        ("daq0:loss=nan", "loss must be 0 to 1"),
+        ("daq0:delay_s=-1", "delay_s must be 0 or more"),
         ("daq0:loss=often", "'often' is not a number"),
-        ("daq0:seed=inf", "seed is a finite number"),
-        ("daq0:delay_s=inf", "delay_s is a finite number"),
+        ("daq0:seed=inf", "seed must be a finite number"),
+        ("daq0:delay_s=inf", "delay_s must be a finite number"),
         ("i2c0@DAC:nack=1", "'DAC' is not an I2C address"),
     ],
 )

@@ -143,7 +143,7 @@ BAD: list[tuple[str, Callable[[Path], None], str]] = [
     ("unknown twin", _text('"piezo_stack"', '"warp_drive"'), "kind 'warp_drive' is unknown; known kinds: piezo_stack"),
     ("no rate", _text("rate_hz = 1000.0", ""), "neither 'rate_hz' nor 'time_column'"),
     ("negative rate", _text("1000.0", "-5"), "rate_hz must be positive"),
-    ("no output", _text('role = "output"', 'role = "context"'), "no channel with role = 'output'"),
+    ("no output", _text('role = "output"', 'role = "context"'), "no channel has role = 'output'"),
     ("bad noise", _text("70.0", "-1"), "noise_rms must be positive"),
     ("NaN", _line(11, "0.01,1,nan,3"), r"column 'z' sample 10 \(line 12\): nan"),
     ("not a number", _line(5, "0.004,1,oops,3"), "line 6: column 'z': 'oops' is not a number"),

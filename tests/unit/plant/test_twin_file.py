@@ -89,7 +89,7 @@ scale_V_per_g = { voltage_x = 1.0, voltage_y = 0.9 }
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("piezo_stack", "state_space", "no \\[twin\\] of a kind that can be run here"),
+        ("piezo_stack", "state_space", "no \\[twin\\] that a bench can run"),
         ("first_order_lag", "flux", "1: no effect of the vocabulary"),
         ("c3 = 0.005", "", "2: the parameters of creep are not complete"),
         ("offset_um = 0.4", 'offset_um = "no"', "offset_um must be a finite number"),

@@ -69,7 +69,9 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
             rec = with_equations(rec)
             other = replace(rec, twin=load_twin(path))
             if other.twin.kind != rec.twin.kind:
-                raise RecordingError(f"{path}: is a {other.twin.kind}, {rec.path} is recorded for a {rec.twin.kind}")
+                raise RecordingError(
+                    f"{path} is a {other.twin.kind} and {rec.path} describes a {rec.twin.kind}; give one of that kind"
+                )
             found = free_run(other)
             return {o: units.convert(y, rec.unit[o], rec.file_unit[o]) for o, y in found.items()}
         case ".py":
@@ -77,7 +79,7 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
         case ".fmu":
             return _run_fmu(path, rec)
         case suffix:
-            raise RecordingError(f"{path}: a twin ends in {', '.join(KINDS)}, not '{suffix}'")
+            raise RecordingError(f"{path}: the ending '{suffix}' is no twin; it must be one of {', '.join(KINDS)}")
 
 
 def free_run(recording: Recording) -> dict[str, Array]:
@@ -130,7 +132,9 @@ def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
     signals = {s: x for s, x in recording.signals.items() if s in known}
     lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
     if lost:
-        raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
+        raise RecordingError(
+            f"{path}: the FMU has no variable {', '.join(lost)}; name the recording's signals as its variables"
+        )
     found = fmu({**signals, "t": recording.t}, {"hold": "end"})
     return {o: units.convert(np.asarray(y), recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
 
