@@ -87,8 +87,7 @@ noise_rms = 0.02
 
 `hold = "zero"` says that a computer held the force over each sample. Without it the verdict here is `unexplained`,
 although friction is named. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know
-it. One `hold` counts for all inputs. A measured input beside a held command then looks half a sample late, and that
-delay can make the engine take an effect for a more general one (a lag for rate-dependent hysteresis).
+it. Where inputs differ, give each its own: `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function ([a twin of your own](adding/twin.md)). An output that has the name of
 a state is converted to the state's unit. The engine tries missing forces at every state:
