@@ -93,7 +93,7 @@ class Run:
     paths: Mapping[str, Path] = field(default_factory=dict[str, Path])
     about: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
-    def shown(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
+    def behind_path(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""
         path = self.paths.get(output)
         if path is None:

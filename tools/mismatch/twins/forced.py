@@ -79,8 +79,8 @@ class ForcedRun:
         for _ in range(2):
             x = self.states(x0, self.u, self.starts, self.ends)
             every = np.arange(self.run.t.size)
-            shown = {o: self.run.shown(o, self.extra[o] + x @ row, every) for o, row in self.rows.items()}
-            missed = {o: self.run.measured[o] - y for o, y in shown.items()}
+            read = {o: self.run.behind_path(o, self.extra[o] + x @ row, every) for o, row in self.rows.items()}
+            missed = {o: self.run.measured[o] - y for o, y in read.items()}
             x0 = x0 + ss.states(missed)
         return x0
 
@@ -105,7 +105,7 @@ class ForcedRun:
         for _ in range(1 if self.forces is None else 3):
             x = self.states(x0, part, before, after)
             for o, row in self.rows.items():
-                need[o][seen] = run.measured[o][seen] - run.shown(o, self.extra[o][seen] + x @ row, seen)
+                need[o][seen] = run.measured[o][seen] - run.behind_path(o, self.extra[o][seen] + x @ row, seen)
             x0 = x0 + ss.states(need)
         return x0
 

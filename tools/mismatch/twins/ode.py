@@ -314,7 +314,7 @@ class OdeTwin(Head):
 
         def misses(x0: Array) -> Array:
             x = go(x0, before, after, part, t)
-            return (y - self._shown(run, self.equations.readings(x, part, t, values), seen)) * weight
+            return (y - self._behind_paths(run, self.equations.readings(x, part, t, values), seen)) * weight
 
         def plain() -> Array:
             # a run of the engineer's own model from its own start gives first guesses for later stretches
@@ -346,8 +346,8 @@ class OdeTwin(Head):
         def misses_all(some: Array) -> Array:
             x = go(with_some(some), starts, ends, u, run.t)
             tried.append((some, x))
-            shown = self.equations.readings(x[at], part, t, values)
-            return (y - (self._shown(run, shown, every)[seen] if run.paths else shown)) * weight
+            readings = self.equations.readings(x[at], part, t, values)
+            return (y - (self._behind_paths(run, readings, every)[seen] if run.paths else readings)) * weight
 
         found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
         # each stretch starts anew, and has been run from the state that was found
@@ -357,11 +357,11 @@ class OdeTwin(Head):
             out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
         return out
 
-    def _shown(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
+    def _behind_paths(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""
         if not run.paths:
             return y
-        return np.stack([run.shown(o, y[:, i], at) for i, o in enumerate(self.outputs)], axis=1)
+        return np.stack([run.behind_path(o, y[:, i], at) for i, o in enumerate(self.outputs)], axis=1)
 
     @cached_property
     def has_exact_steps(self) -> bool:
