@@ -34,7 +34,7 @@ def reproduce(
     ] = None,
     rows: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Folder of finished sets of section measured; a stopped run goes on there."),
+        typer.Option(metavar="FILE", help="JSON of finished sets of section measured; a stopped run goes on there."),
     ] = None,
 ) -> None:
     """Compute published figures again and print them beside ours.

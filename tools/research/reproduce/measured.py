@@ -54,6 +54,19 @@ def chosen(only: Sequence[str]) -> list[MeasuredSet]:
     return [s for s in SETS if not only or any(o in s.name for o in only)]
 
 
+def _finished(path: Path) -> dict[str, Any]:
+    """Return the finished sets in the file. Raises InputError for a folder, and for a file of another kind."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: no JSON of finished sets ({error}); name a new file, or one of an earlier run"
+        ) from error
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: no finished sets in it; name a new file, or one of an earlier run")
+    return found
+
+
 def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path | None = None) -> Table:
     """Run the sets and compare. ``rows_file`` (JSON) keeps each that is done; what it holds is not run again.
     ``before``: a result of an earlier run, whose rows stand for the other sets.
@@ -61,7 +74,7 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path 
     begin = time.perf_counter()
     wanted = chosen(only)
     check()
-    kept: dict[str, Any] = json.loads(rows_file.read_text()) if rows_file is not None and rows_file.exists() else {}
+    kept = _finished(rows_file) if rows_file is not None and rows_file.exists() else {}
     found: dict[str, Scored] = {name: _scored(name, k) for name, k in kept.items()}
     diagnosed: dict[str, tuple[dict[str, Any], float]] = {}
     for s in wanted:
