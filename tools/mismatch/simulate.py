@@ -215,7 +215,7 @@ class Model:
     def in_front(self, view: View, theta: Array) -> dict[str, Array]:
         """Return the outputs (n,) of a free run in front of the effects at outputs."""
         outputs = self._courses(view_run(self.twin, view), Pass(theta, True))[1]
-        return {o: view.take(s.value) for o, s in outputs.items()}
+        return {o: view.take(fold(s, theta).value) for o, s in outputs.items()}
 
     def whole(self, view: View, theta: Array) -> dict[str, Array]:
         """Return the outputs over the whole recording (n,) from the start states that the view allows; cached."""
@@ -342,7 +342,8 @@ class Model:
         """
         inside = inside_of(self.twin)
         paths = self._paths(run, how.theta)
-        run = replace(run, bent=self.bends, paths=paths)
+        beside = self._beside(run, how.theta) if run.window and not forces else {}
+        run = replace(run, bent=self.bends, paths=paths, beside=beside)
         outputs = self.twin.respond(run, inputs, how.theta, forces, how.join)
         if not run.window:
             return outputs, run
@@ -378,14 +379,35 @@ class Model:
                 now = self._pass(run, k, was, by, o, how)
                 # with weights the outputs of a linear twin would be affine in them no more
                 afresh = inside.integrates if inside is not None else self.twin.restart and not pl.parts.weights
-                if afresh and pl.effect.driven and o not in run.paths:
+                if afresh and (pl.effect.driven or inside is not None) and o not in run.paths:
                     # the start states depend on it
                     if how.folded is not None:
                         how.folded.update(now.columns)
                     now = fold(now, how.theta)
                     change[o] = change.get(o, 0.0) + now.value - fold(was, how.theta).value
                 found[o] = now
-        return found, change
+        return {o: fold(s, how.theta) if how.join else s for o, s in found.items()}, change
+
+    def _beside(self, run: Run, theta: Array) -> dict[str, dict[int, Array]]:
+        """Return the columns of what is added behind the outputs of a linear twin that nothing bends.
+
+        A drift or a step is part of what was measured, and of no start state. Where an effect is driven by the output
+        with weights, its columns would depend on the start and therefore on all of these weights.
+        """
+        found: dict[str, dict[int, Array]] = {}
+        if not isinstance(self.twin, DynamicTwin | CascadeTwin):
+            return found
+        how = Pass(theta, False)
+        for o in self.twin.outputs:
+            behind = [k for k in self.order if self.placed[k].site == "output" and o in self.placed[k].outputs]
+            if any(self.placed[k].effect.driven and self.placed[k].effect.kind != "linear" for k in behind):
+                continue
+            still = Signal(np.zeros(run.t.size))
+            for k in behind:
+                still = self._pass(run, k, still, None, o, how)
+            if still.columns:
+                found[o] = dict(still.columns)
+        return found
 
     def _paths(self, run: Run, theta: Array) -> dict[str, Path]:
         """Return the paths of the outputs behind which only linear effects are driven."""

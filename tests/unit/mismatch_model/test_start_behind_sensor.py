@@ -124,3 +124,35 @@ def test_the_start_of_a_run_with_a_force_inside_is_read_behind_a_late_sensor(kin
     theta = np.concatenate([twin.start(rec), np.zeros(len(drag.parts.weights)), [0.006]])
     r = model.residual(View(rec, ((0, 3000),), 40), theta)["position"]
     assert np.sqrt(np.mean(r[40:] ** 2)) < 1.5e-6
+
+
+@pytest.mark.parametrize("kind", ["mechanical_axis", "ode"])
+def test_a_drift_of_a_sensor_is_no_start_state(kind: str) -> None:
+    """A free mass starts anew in each stretch, where its sensor shows the place less what has drifted by then."""
+    rng, n, dt, noise = np.random.default_rng(12), 4000, 0.002, 1e-3
+    u = np.repeat(rng.uniform(-4.0, 4.0, n // 5), 5)
+    a = np.array([[0.0, 1.0], [0.0, -6.0]])
+    whole = expm(np.block([[a, np.array([[0.0], [2.0]])], [np.zeros((1, 3))]]) * dt)
+    x, y = np.array([0.3, 0.2]), np.empty(n)
+    for k in range(n):
+        y[k] = x[0]
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[k]
+    y += 0.5 * np.exp(-np.arange(n) * dt / 2.0) + rng.normal(0.0, noise, n)
+    if kind == "ode":
+        own: dict[str, object] = {"c": 6.0, "m": 2.0, "hold": "zero", "fixed": ["c", "m"]}
+        own |= {"states": {"x": {"unit": "m"}, "v": {"unit": "m/s"}}, "outputs": {"position": "x"}}
+        own |= {"equations": {"x": "v", "v": "m * force - c * v"}}
+    else:
+        own = {"mass": 0.5, "damping": 3.0, "hold": "zero"}
+    rec = recording(kind, {"force": u}, {"position": y}, own)
+    twin = make(rec)
+    ranges = ((0, 1300), (1320, 2600), (2620, n))
+    view = View(rec, ranges, 40, fit=ranges)
+    drift = Placed(EFFECTS["thermal_drift"], "output", "position", "sensor", ("position",), {"time": (0.02, 30.0)})
+    model = Model(twin, [drift])
+    assert twin.restart
+    none, some = (model.residual(view, np.concatenate([twin.start(rec), [2.0, w]]))["position"] for w in (0.0, 1.0))
+    per_unit = some - none
+    left = none - per_unit * (per_unit @ none) / (per_unit @ per_unit)
+    assert np.sqrt(np.mean(none**2)) > 5 * noise
+    assert np.sqrt(np.mean(left**2)) < 1.1 * noise

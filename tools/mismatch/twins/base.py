@@ -75,6 +75,7 @@ class Run:
     between the states and the measured outputs, which are then no linear function of a start state. ``wanted``: sorted
     sample numbers of which alone a response may consist (None: it consists of all). ``paths``: of the outputs that were
     measured behind linear effects; ``about``: an earlier run of these outputs (n,), else they are zero there.
+    ``beside``: what is added behind each output per unit of a weight; start states are read off the rest.
     """
 
     t: Array
@@ -92,6 +93,7 @@ class Run:
     wanted: NDArray[np.int64] | None = None
     paths: Mapping[str, Path] = field(default_factory=dict[str, Path])
     about: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    beside: Mapping[str, Mapping[int, Array]] = field(default_factory=dict[str, Mapping[int, Array]])
 
     def behind_path(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""

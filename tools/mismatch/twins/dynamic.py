@@ -130,7 +130,8 @@ class DynamicTwin(Head):
         n = run.t.size
         plant = self.plant_of(theta)
         # one state and one input: a single run from the right start state does, without columns
-        alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2 and not run.paths
+        alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2
+        alone = alone and not run.paths and not run.beside
         if forces or (alone and run.setting is None and (self.start_given or not run.period)):
             return self._with_forces(run, inputs, theta, forces)
         by_hold: dict[Hold, list[Discrete]] = {
@@ -142,7 +143,7 @@ class DynamicTwin(Head):
             h: [(b.ad.tobytes(), b.g0.tobytes(), b.g1.tobytes(), run.starts) for b in of] for h, of in by_hold.items()
         }
         value: dict[str, Array] = {o: np.zeros(n) for o in self.outputs}
-        columns: dict[int, dict[str, Array]] = {}
+        columns: dict[int, dict[str, Array]] = {j: {} for of in run.beside.values() for j in of}
         folded: list[float] = []
 
         def states(u: Array, token: object, k: int, hold: Hold) -> Array:
@@ -248,7 +249,6 @@ class DynamicTwin(Head):
         """Add the free response of the start states: the engineer's, or those that the first samples determine."""
         n = run.t.size
         zero = np.zeros(n)
-        nothing = dict.fromkeys(self.outputs, zero)
         given = self.start_given or (run.window == 0 and not run.period)
         read = run.setting is not None and not (run.bent and self.at_rest)
         if given and not read and self.fixed_free is not None and run.starts == (0,):
@@ -265,11 +265,13 @@ class DynamicTwin(Head):
                     continue
                 for o in group:
                     value[o] = ss.added(value[o].copy(), x0, o)
-                for entry in columns.values():
-                    if not any(o in entry for o in group):
+                for j, entry in columns.items():
+                    added = {o: run.beside.get(o, {}).get(j) for o in group}
+                    if not any(o in entry or added[o] is not None for o in group):
                         continue
                     group_values = {o: entry.get(o, zero) for o in group}
-                    x0 = ss.steady(group_values, run.period) if run.period else ss.met(group_values, nothing)
+                    wanted = {o: zero if c is None else -c for o, c in added.items()}
+                    x0 = ss.steady(group_values, run.period) if run.period else ss.met(group_values, wanted)
                     for o in group:
                         # a copy, because the column may be cached
                         entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
