@@ -227,6 +227,19 @@ def test_the_base_alone(kind: str) -> None:
     same(corrected(made(kind), []))
 
 
+@pytest.mark.parametrize("hold", [{"u": "zero"}, {"u": "linear", "w": "zero"}, {"u": "zero", "w": "smooth"}])
+def test_each_input_keeps_its_hold(hold: dict[str, str]) -> None:
+    rec = several()
+    given = {k: v for k, v in rec.twin.parameters.items() if k != "hold"}
+    same(corrected(replace(rec, twin=replace(rec.twin, parameters={**given, "hold": hold})), []))
+
+
+@pytest.mark.parametrize("rate", [3.0, 400.0])  # of one and of several steps per sample
+def test_each_input_of_equations_keeps_its_hold(rate: float) -> None:
+    table: dict[str, Any] = {"states": {"x": "V"}, "equations": {"x": "rate * (heat + 0.5*air - x - 0.1*x**3)"}}
+    same(corrected(equations({**table, "rate": rate, "hold": {"heat": "zero"}}, ("heat", "air"), ("x",), "V"), []))
+
+
 @pytest.mark.parametrize("eighth", [0, *(pytest.param(q, marks=pytest.mark.slow) for q in range(1, 8))])
 @pytest.mark.parametrize(("name", "index", "form"), FORMS, ids=[f"{n} {i}" for n, i, _ in FORMS])
 def test_every_effect_at_every_place_of_every_twin(name: str, index: int, form: Effect, eighth: int) -> None:
