@@ -119,7 +119,12 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("states", "table by state", "name and unit of each row of A: forces are then tried inside", "none"),
         ),
         "columns": (
-            Key("offset", _PER_OUTPUT, "added to the column of simulated output", "0"),
+            Key(
+                "offset",
+                _PER_OUTPUT,
+                "added to the column of simulated output, the input simulated_NAME of output NAME",
+                "0",
+            ),
             Key("scale", _PER_OUTPUT, "times the column", "1"),
         ),
         "instrument": (
@@ -131,16 +136,23 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key(
                 "states",
                 "table by state",
-                "unit (an output of that name is converted to it), start and limits of each state",
+                "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start is a"
+                " first guess, because the first samples set the states",
             ),
             Key(
                 "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
             ),
             Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
-            Key("function", "file.py:name", "derivatives(t, states, inputs, parameters) in place of equations", "none"),
+            Key(
+                "function",
+                "file.py:name",
+                "derivatives(t, states, inputs, parameters) in place of equations; each is a mapping by name, and so is"
+                " the result",
+                "none",
+            ),
             Key(
                 "units",
-                "table by name",
+                "table by name, as in [twin.units]",
                 "of each parameter; of an input or output that the equations want in another unit than its column's",
                 "none",
             ),

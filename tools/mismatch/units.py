@@ -92,6 +92,8 @@ _SYMBOLS = MappingProxyType(
         "arcsec": (_d(rad=1), math.pi / 648000, 0.0, False),
         "rev": (_d(rad=1), 2 * math.pi, 0.0, False),
         "turn": (_d(rad=1), 2 * math.pi, 0.0, False),
+        "kn": (_d(m=1, s=-1), 1852.0 / 3600.0, 0.0, False),
+        "mph": (_d(m=1, s=-1), 0.44704, 0.0, False),
         "rpm": (_d(s=-1, rad=1), 2 * math.pi / 60, 0.0, False),
         "count": (_d(count=1), 1.0, 0.0, False),
         "counts": (_d(count=1), 1.0, 0.0, False),
@@ -101,6 +103,14 @@ _SYMBOLS = MappingProxyType(
         "lsb": (_d(count=1), 1.0, 0.0, False),
     }
 )
+
+
+def listed() -> str:
+    """Return the symbols of all units as text; of those that are the same the first."""
+    first = {unit: symbol for symbol, unit in list(_SYMBOLS.items())[::-1]}
+    return ", ".join(symbol for symbol in _SYMBOLS if symbol in first.values())
+
+
 _PREFIXES = MappingProxyType(
     {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1}
     | {"k": 1e3, "M": 1e6, "G": 1e9}
@@ -145,7 +155,8 @@ def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
     entry = _SYMBOLS.get(rest)
     if prefix in _PREFIXES and entry is not None and entry[3]:
         return entry[0], entry[1] * _PREFIXES[prefix], 0.0
-    raise UnitError(f"unknown unit '{text}'" + (f" (symbol '{symbol}')" if symbol != text else ""))
+    where = f" (symbol '{symbol}')" if symbol != text else ""
+    raise UnitError(f"unknown unit '{text}'{where}; known, with powers and SI prefixes: {listed()}")
 
 
 def is_unit(text: str | None) -> bool:

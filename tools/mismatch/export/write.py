@@ -201,5 +201,6 @@ def _csv(header: Sequence[str], values: Sequence[Array]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(zip(*(v.tolist() for v in values), strict=True))
+    # twelve digits: a time in steps of 0.05 s is written as such
+    writer.writerows(zip(*([f"{x:.12g}" for x in v.tolist()] for v in values), strict=True))
     return out.getvalue()

@@ -9,10 +9,12 @@ import argparse
 import os
 import re
 import tempfile
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tools.mismatch import key_tables as keys
+from tools.mismatch import units
 from tools.mismatch.keys import Key
 from tools.mismatch.new import new_recording
 from tools.mismatch.recording_columns import SUFFIXES
@@ -74,6 +76,8 @@ Where time steps are uneven or values are missing, the command names the line an
 `--cut`: it resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
 `recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the sample at which each
 begins, and one diagnosis covers all runs.
+
+{units}
 
 Write the parameters that you believe before you ask what is missing:
 
@@ -161,6 +165,8 @@ def page() -> str:
     formats = "\n".join(f"- `{ending}`: {what}" for ending, what in FORMATS.items())
     endings = ", ".join(f"`{s}`" for s in SUFFIXES if s not in TEXT)
     guide = _GUIDE.replace("{formats}", formats).replace("{endings}", endings).replace("{written}", written())
+    known = f"Units are products and powers of these symbols, with SI prefixes: {units.listed()}; 1 is no unit."
+    guide = guide.replace("{units}", "\n".join(textwrap.wrap(known, 120)))
     lines = [guide, "## Every key of `recording.toml`", ""]
     for heading, table in keys.tables():
         lines += [f"### {heading}", "", *_rows(table), ""]
