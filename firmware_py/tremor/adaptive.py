@@ -66,6 +66,7 @@ class AdaptiveParams:
     ease: float = field("1")  # share of the way to the solved filter in one tick
     relative: float = field("1")
     relative_power: float = field("1")
+    relative_beyond: float = field("1")
     quiet_power: float = field("1")
     core_weight: Array = field("1", 5)
     core_tremor: Array = field("sample^2/m^2", LEVELS, "m", "m")
@@ -175,6 +176,7 @@ def adaptive_params(config: TremorConfig) -> Records[AdaptiveParams]:
         ease=1.0 - exp(-1.0 / (a.ease_s * config.tick_hz)) if a.ease_s > 0.0 else 1.0,
         relative=a.relative,
         relative_power=a.relative_powers[0],
+        relative_beyond=a.relative_beyond,
         quiet_power=a.relative_powers[1],
         **{f"core_{name}": value for name, value in vars(d.core).items()},
     )
@@ -535,7 +537,7 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
             )  # fmt: skip
             _take(part, share, 1e300 if other == axis else power, state)
     if params.relative > 0.0:
-        counts = params.relative * wider**params.relative_power
+        counts = params.relative * max(wider - params.relative_beyond, 0.0) ** params.relative_power
         power = _mean_core_power(state, axis, level, params)
         for i in range(m):
             for j in range(i + 1):

@@ -64,7 +64,8 @@ class Bank:
 
 @dataclass(frozen=True)
 class CoreDesign:
-    """The same as the fields of ``AdaptiveDesign`` of these names, of signals that pass ``weight``: the tremor band."""
+    """The same as the fields of ``AdaptiveDesign`` of these names, of signals that pass ``weight``: the tremor band,
+    and with ``core_above`` what is above it."""
 
     weight: Array
     tremor: Array
@@ -341,6 +342,11 @@ def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
     return b, denominator
 
 
+def _high_pass(denominator: Array) -> Array:
+    """Return the numerator of the high-pass with this ``denominator``: its gain is 1 at half the tick rate."""
+    return np.array([1.0, -2.0, 1.0]) * (denominator[0] - denominator[1] + denominator[2]) / 4.0
+
+
 def _shelf(hz: float, gain: float, tick_hz: float) -> tuple[Array, Array]:
     """Return numerator and denominator of a filter that is 1 far below ``hz`` and ``gain`` far above it.
 
@@ -415,6 +421,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     first = of_axis(0)
     axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
     core_b, core_a = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
+    core_b = (core_b + a.core_above * _high_pass(core_a)) / sqrt(1.0 + (a.core_above * a.core_q) ** 2)  # 1 at the peak
     core = _core_design(config, s, (core_b, core_a), plain=plain, target=target, wanted=wanted, moving=moving)
     lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
     found = AdaptiveDesign(

@@ -117,14 +117,15 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "cancel_from_hz": (3.0, 6.0),
                 "cancel_to_hz": (13.0, 16.0),
                 "emphasis": 1.0,
-                "relative": 10.0,
-                "relative_powers": (1.15, 1.3),
-                "above": 8.0,
+                "relative": 15.0,
+                "relative_powers": (1.3, 1.6),
+                "relative_beyond": 1.0,
                 "core_q": 4.0,
+                "core_above": 0.3,
                 "prior_s": 0.2,
                 "burst_prior_s": 0.5,
                 "share": 0.4,
-                "quiet": 130.0,
+                "quiet": 55.0,
                 "shaken_hz": (600.0, 700.0),
             }
         )
@@ -150,9 +151,12 @@ class AdaptiveConfig(_Table):
     all that is cancelled and, ``relative`` times, in the tremor band (a peak at ``emphasis_hz`` with ``core_q``); so a
     hand whose slow motion is larger does not get less of its tremor cancelled. The penalty above the band is then
     relative to the tremor, too. ``relative_powers``: with which powers of all motion over the tremor the tremor's error
-    and the penalty count; 1 is relative, more is stricter where a hand's other motion is large.
-    0: the error is counted in metres. ``above``: an error above ``above_hz`` counts so many times an error below it, so
-    that the filter does not enlarge motion of the hand that it is not to cancel.
+    and the penalty count; 1 is relative, more is stricter where a hand's other motion is large. ``relative_beyond``: so
+    much of the tremor's power is taken off all motion before the tremor's error is weighed. With 1 it counts by the
+    other motion over the tremor: in a hand that has no other motion, both count alike. ``core_above``: errors above the
+    tremor band count as the tremor's own do, by this share of a high-pass that is added to the peak; so their weight
+    grows with the hand's other motion. ``relative`` 0: the error is counted in metres. ``above``: an error above
+    ``above_hz`` counts so many times an error below it, in every hand.
     """
 
     preset: str = ""
@@ -167,9 +171,11 @@ class AdaptiveConfig(_Table):
     emphasis_q: Positive = 1.5
     relative: NotNegative = 0.0
     relative_powers: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    relative_beyond: Share = 0.0
     above: Annotated[float, Field(ge=1.0, le=100.0)] = 1.0
     above_hz: Positive = 18.0
     core_q: Positive = 2.5
+    core_above: NotNegative = 0.0
     block_s: Positive = 0.01
     half_width_s: Positive = 0.5
     memory_s: Positive = 15.0

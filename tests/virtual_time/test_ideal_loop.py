@@ -23,10 +23,10 @@ def test_the_ideal_loop_cancels_most_of_the_tremor(row: IdealRow) -> None:
 
 @pytest.mark.slow
 def test_the_ideal_loop_is_near_the_bound(row: IdealRow) -> None:
-    assert row.ratio == pytest.approx(1.203, abs=0.01)
+    assert row.ratio == pytest.approx(1.302, abs=0.01)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="1.203, goal 1.2: docs/limits.md")
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="1.302, goal 1.2: docs/limits.md")
 def test_the_ideal_loop_is_within_its_goal(row: IdealRow) -> None:
     assert row.ratio < GOAL

@@ -239,11 +239,13 @@ def _system(state: Any, param: Any, level: int, part: str) -> tuple[np.ndarray, 
     return np.tril(below) + np.tril(below, -1).T + n0 * prior, right, power
 
 
-@pytest.mark.parametrize("powers", [(1.0, 0.5), (1.15, 1.3)])
-def test_relative_errors_add_up_over_the_whole_band_and_the_tremor(powers: tuple[float, float]) -> None:
+@pytest.mark.parametrize(("powers", "beyond"), [((1.0, 0.5), 0.0), ((1.15, 1.3), 0.0), ((1.3, 1.6), 1.0)])
+def test_relative_errors_add_up_over_the_whole_band_and_the_tremor(powers: tuple[float, float], beyond: float) -> None:
     """The learned filter solves the sum of two systems, each over its own motion's power, with the prior in both."""
     relative = 12.0
-    adaptive = AdaptiveConfig(share=0.0, emphasis=1.0, relative=relative, relative_powers=powers)
+    adaptive = AdaptiveConfig(
+        share=0.0, emphasis=1.0, relative=relative, relative_powers=powers, relative_beyond=beyond
+    )
     config = TremorConfig(adaptive=adaptive)
     record = make_record(3, "one tone", 6.0)
     estimator = Estimator(config)
@@ -253,7 +255,7 @@ def test_relative_errors_add_up_over_the_whole_band_and_the_tremor(powers: tuple
         whole, right, all_power = _system(state, param, level, "")
         core, core_right, tremor_power = _system(state, param, level, "core_")
         rows, wider = state.count[0, level] + param.prior_blocks[level], all_power / tremor_power
-        counts = relative * wider ** powers[0]
+        counts = relative * max(wider - beyond, 0.0) ** powers[0]
         matrix = whole + counts * core + rows * wider ** powers[1] * param.quiet[0]
         right = right + counts * core_right
         found = np.array(state.solved[0, level])
@@ -336,18 +338,42 @@ def test_errors_above_the_band_count_more(rate_hz: float) -> None:
         AdaptiveConfig(emphasis=2.0, above=10.0)
 
 
+def _passed_above(acceleration: np.ndarray, **keys: float) -> float:
+    """Power at 18 to 24 Hz that a filter lets through once it has learned this hand."""
+    hz = np.arange(18.0, 24.0, 0.5)
+    config = TremorConfig(adaptive=AdaptiveConfig.model_validate({"emphasis": 1.0, "core_q": 4.0, **keys}))
+    estimator = Estimator(config)
+    estimator.run(np.repeat(acceleration[:, None], 3, axis=1))
+    ahead = np.array(peek(estimator.state).adaptive.solved[0, 1, 1])
+    features = design_adaptive(config).bank.response(np.exp(2j * np.pi * hz / config.tick_hz))
+    return float(np.mean(np.abs(ahead @ features * sensor_response(config, hz)) ** 2))
+
+
 def test_motion_above_the_band_is_not_enlarged() -> None:
     """A filter that has learned a hand passes less than half as much motion at 18 to 24 Hz."""
-    record, hz = make_record(3, "two tones", 8.0), np.arange(18.0, 24.0, 0.5)
-    passed: dict[float, float] = {}
-    for above in (1.0, 10.0):
-        config = TremorConfig(adaptive=AdaptiveConfig(emphasis=1.0, relative=10.0, core_q=4.0, above=above))
-        estimator = Estimator(config)
-        estimator.run(np.repeat(record.acceleration[:, None], 3, axis=1))
-        ahead = np.array(peek(estimator.state).adaptive.solved[0, 1, 1])
-        features = design_adaptive(config).bank.response(np.exp(2j * np.pi * hz / config.tick_hz))
-        passed[above] = float(np.mean(np.abs(ahead @ features * sensor_response(config, hz)) ** 2))
-    assert passed[10.0] < 0.25 * passed[1.0], passed
+    hand = make_record(3, "two tones", 8.0).acceleration
+    plain, weighed = (_passed_above(hand, relative=10.0, above=above) for above in (1.0, 10.0))
+    assert weighed < 0.25 * plain
+
+
+@pytest.mark.parametrize("rate_hz", [500.0, 1000.0, 2000.0])
+def test_errors_above_the_band_count_as_the_tremors_own(rate_hz: float) -> None:
+    """The tremor band's filter is 1 at its peak; far above it is the share beside a peak of quality 4."""
+    config = TremorConfig(tick_hz=rate_hz, adaptive=AdaptiveConfig(core_q=4.0, core_above=0.3))
+    b0, b1, b2, a1, a2 = design_adaptive(config).core.weight
+    back = np.exp(-2j * np.pi * np.array([0.5, 9.8, 120.0]) / rate_hz)
+    gain = np.abs((b0 + b1 * back + b2 * back**2) / (1.0 + a1 * back + a2 * back**2))
+    np.testing.assert_allclose(gain, [0.0, 1.0, 0.3 / np.hypot(1.0, 1.2)], rtol=0.02, atol=0.01)
+
+
+def test_the_weight_above_the_band_grows_with_the_other_motion() -> None:
+    """Beside a swing at 5 Hz it takes a larger share off what passes above the band than in the tremor alone."""
+    hand = make_record(3, "two tones", 8.0).acceleration
+    swing = 2.0 * np.std(hand) * np.sin(2.0 * np.pi * 5.0 * np.arange(len(hand)) / RATE_HZ)
+    keys = {"relative": 15.0, "relative_beyond": 1.0}
+    grown = [_passed_above(x, core_above=0.3, **keys) for x in (hand, hand + swing)]
+    plain = [_passed_above(x, **keys) for x in (hand, hand + swing)]
+    assert grown[1] / plain[1] < 0.85 * grown[0] / plain[0], (grown, plain)
 
 
 def test_a_preset_is_the_start_and_the_keys_beside_it_override_it() -> None:

@@ -79,7 +79,7 @@ def ideal_changes(noise: bool) -> dict[str, Any]:
     """Return the changes that make a bench ideal, for ``write_variant``."""
     emulation: dict[str, Any] = dict(PERFECT_EMULATION)
     # the bound pays nothing for what its filter passes above the band, so neither do filter and strokes beside it
-    adaptive: dict[str, Any] = {"quiet": 0.0, "above": 1.0}
+    adaptive: dict[str, Any] = {"quiet": 0.0, "above": 1.0, "core_above": 0.0}
     if not noise:
         emulation = merged(emulation, {"sensors": {"noise_ug_per_rtHz": 0.0}})
         # the estimator takes the sensors' noise out of what it learns, so it must know that there is none
