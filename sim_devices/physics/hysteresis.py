@@ -14,10 +14,13 @@ from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter,
 from sim_devices.physics.statistics import runs, signed_least_squares, thin
 
 N_PLAYS = 10
-FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays", "stops_curved")
-"""Bases from few to many columns; ``choose`` selects one by the data. Each fits loops that the others fit badly:
+N_FINE = 20
+FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays", "stops_curved", "stops_fine")
+"""Bases of columns; ``choose`` selects one by the data. Settings store a form's place here, so new ones are appended.
+Each fits loops that the others fit badly:
 
 stops        Prandtl-Ishlinskii, Maxwell-slip, Iwan
+stops_fine   the same with twice as many thresholds: few plays whose thresholds lie between those of ``stops``
 dahl         smooth elements dz = dx - |dx| z / r: Dahl, Bouc-Wen with exponent one (gamma = 0)
 dahl_stops   both
 dahl_skewed  dz = dx - (|dx| z + g dx |z|) / r as well: Bouc-Wen at large, loops whose branches differ in bend
@@ -134,13 +137,13 @@ def relays(x, lo, hi, count, starts):
 WIDE = (1.3, 1.65)  # half ranges
 N_DAHL = 7
 N_GRID = 8
-ONE_WAY_ROUND = ("stops", "dahl", "dahl_stops", "relays", "stops_curved")
+ONE_WAY_ROUND = ("stops", "stops_fine", "dahl", "dahl_stops", "relays", "stops_curved")
 """Forms whose elements all have weights of one sign. Every loop, also a minor one, has the same sense of rotation,
 because each element dissipates energy (Kuhnen 2003, section 2.2: the weights of plays are not negative)."""
 OF_ONE_LOOP = ("stops", "dahl", "dahl_stops", "stops_curved")
 """Forms in which the outer loop determines every minor loop (Masing's rule, about a middle line that may be bent)."""
 MASING = OF_ONE_LOOP[:3]
-SEVERAL_LOOPS = FORMS[:6]
+SEVERAL_LOOPS = ("stops", "dahl", "dahl_stops", "stops_fine", "dahl_skewed", "stops_bent", "relays")
 CURVES = 2
 """Number of Legendre polynomials, from the second degree, in a curve beside stops."""
 
@@ -217,11 +220,10 @@ def columns(
         return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too=wide_too, bent=bent)[2:]
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
-    # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
-    radii = np.array([*thresholds(half, N_PLAYS), *(f * half for f in WIDE if wide_too)])
+    radii = np.array(radii_of(form, half, wide_too))
     wide = half * np.geomspace(0.05, 4.0, N_DAHL)
     match form:
-        case "stops":
+        case "stops" | "stops_fine":
             return stops(x, radii, rest, at)
         case "dahl":
             return dahl(x, wide, np.zeros(N_DAHL), rest, at)
@@ -248,11 +250,19 @@ def slips_once(lo: float, hi: float, rest: float) -> bool:
     return max(hi - rest, rest - lo) > WIDE[0] * 0.5 * (hi - lo)
 
 
+def radii_of(form: str, half: float, wide_too: bool) -> tuple[float, ...]:
+    """Return the thresholds of a form's stops. ``wide_too``: also beyond half the range, where nothing slips once the
+    extremes were seen; but a record may start at one of them."""
+    count = N_FINE if form == "stops_fine" else N_PLAYS
+    return (*thresholds(half, count), *(f * half for f in WIDE if wide_too))
+
+
 def width_of(form: str, wide_too: bool = False) -> int:
     """Return the number of columns of a form."""
     more = len(WIDE) if wide_too else 0
     return {
         "stops": N_PLAYS + more,
+        "stops_fine": N_FINE + more,
         "dahl": N_DAHL,
         "dahl_stops": N_DAHL + N_PLAYS + more,
         "dahl_skewed": 3 * N_DAHL,

@@ -187,7 +187,7 @@ def _elements(s: Slot, d: str) -> str:
     half, rest = 0.5 * (hi - lo), numbers(settings["rest"][0])
     form = hysteresis.FORMS[int(settings.get("form", (0.0,))[0])]
     wide = settings.get("wide", (0.0,))[0] > 0
-    radii = [*hysteresis.thresholds(half, hysteresis.N_PLAYS), *(f * half for f in hysteresis.WIDE if wide)]
+    radii = hysteresis.radii_of(form, half, wide)
     smooth = half * np.geomspace(0.05, 4.0, hysteresis.N_DAHL)
     before = hysteresis.way_before(settings)
 
@@ -205,7 +205,7 @@ def _elements(s: Slot, d: str) -> str:
 
     n = hysteresis.N_DAHL
     match form:
-        case "stops":
+        case "stops" | "stops_fine":
             return plain()
         case "dahl":
             return soft(smooth, np.zeros(n))
