@@ -141,67 +141,87 @@ def _time(table: dict[str, Any], key: str) -> float:
     return float(value)
 
 
-def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
-    recorder = session.recorder
-    looking = asyncio.Lock()
+class _Collect:
+    """Answers the requests of the Recordings view: record, look, export, recover, cut, delete."""
 
-    def existing(request: Request) -> Path:
-        path = recorder.path(check_name(request.path_params["name"]))
+    def __init__(self, session: Session, jobs: Jobs) -> None:
+        self._session = session
+        self._jobs = jobs
+        self._recorder = session.recorder
+        self._looking = asyncio.Lock()
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the routes of the view."""
+        return [
+            Route("/api/recordings", clear(self._recordings)),
+            Route("/api/recording/start", clear(self._start), methods=["POST"]),
+            Route("/api/recording/stop", clear(self._stop), methods=["POST"]),
+            Route("/api/recording/note", clear(self._note), methods=["POST"]),
+            Route("/api/recordings/{name}/look", clear(self._look)),
+            Route("/api/recordings/{name}/file", clear(self._download)),
+            Route("/api/recordings/{name}/export", clear(self._export), methods=["POST"]),
+            Route("/api/recordings/{name}/recover", clear(self._recover), methods=["POST"]),
+            Route("/api/recordings/{name}/span", clear(self._span), methods=["POST"]),
+            Route("/api/recordings/{name}/delete", clear(self._delete), methods=["POST"]),
+        ]
+
+    def _existing(self, request: Request) -> Path:
+        path = self._recorder.path(check_name(request.path_params["name"]))
         if not is_own_file(path):
             raise InputError(f"there is no recording {path.stem!r}")
         return path
 
-    async def recordings(_: Request) -> Any:
-        now = recorder.name if recorder.active else ""
+    async def _recordings(self, _: Request) -> Any:
+        now = self._recorder.name if self._recorder.active else ""
         formats = [[ending, known.readers] for ending, known in FORMATS.items()]
-        recordings = await asyncio.to_thread(listing, recorder.folder, now)  # reads the notes of up to 500 files
-        return {"folder": str(recorder.folder), "recordings": recordings, "formats": formats}
+        recordings = await asyncio.to_thread(listing, self._recorder.folder, now)  # reads the notes of up to 500 files
+        return {"folder": str(self._recorder.folder), "recordings": recordings, "formats": formats}
 
-    async def start(request: Request) -> Any:
+    async def _start(self, request: Request) -> Any:
         table = await body(request)
-        await session.start_recording(text(table, "name", longest=80), text(table, "notes"))
-        return {"name": recorder.name}
+        await self._session.start_recording(text(table, "name", longest=80), text(table, "notes"))
+        return {"name": self._recorder.name}
 
-    async def stop(_: Request) -> Any:
-        return await session.stop_recording()
+    async def _stop(self, _: Request) -> Any:
+        return await self._session.stop_recording()
 
-    async def note(request: Request) -> Any:
-        recorder.note(text(await body(request), "text"), session.bench_time_ns())
+    async def _note(self, request: Request) -> Any:
+        self._recorder.note(text(await body(request), "text"), self._session.bench_time_ns())
 
-    async def look(request: Request) -> Any:
+    async def _look(self, request: Request) -> Any:
         channels = request.query_params.get("channels", "command_1,command_2,command_3").split(",")
-        async with looking:  # each may hold a chunk of 64 MiB
-            return await asyncio.to_thread(quick_look, existing(request), channels)
+        async with self._looking:  # each may hold a chunk of 64 MiB
+            return await asyncio.to_thread(quick_look, self._existing(request), channels)
 
-    async def download(request: Request) -> Any:
-        path = existing(request)
+    async def _download(self, request: Request) -> Any:
+        path = self._existing(request)
         return FileResponse(path, filename=path.name)
 
-    async def export(request: Request) -> Any:
-        path, kind = existing(request), text(await body(request), "format")
+    async def _export(self, request: Request) -> Any:
+        path, kind = self._existing(request), text(await body(request), "format")
         if kind not in FORMATS:
             raise InputError(f"{kind!r} is not a format; there are {', '.join(FORMATS)}")
-        folder = jobs.new_folder()
+        folder = self._jobs.new_folder()
         out = folder / f"{path.stem}.{kind}"
         command = ["tools.cli.main", "export", str(path), "--out", str(out)]
-        return jobs.start("export", f"export {out.name}", [command], folder).as_dict()
+        return self._jobs.start("export", f"export {out.name}", [command], folder).as_dict()
 
-    async def recover(request: Request) -> Any:
+    async def _recover(self, request: Request) -> Any:
         """Make a finished recording of what is sound in a torn one, beside it; the original stays."""
-        path = existing(request)
-        if (recorder.active and path == recorder.path(recorder.name)) or is_being_recorded(path):
+        path = self._existing(request)
+        if (self._recorder.active and path == self._recorder.path(self._recorder.name)) or is_being_recorded(path):
             raise InputError(f"{path.stem!r} is being recorded; stop it first")
-        out = recorder.path(check_name(f"{path.stem[:60]} recovered"))
+        out = self._recorder.path(check_name(f"{path.stem[:60]} recovered"))
         if out.exists() or out.is_symlink():
             raise InputError(f"there is a recording {out.stem!r} already; delete it first")
-        folder = jobs.new_folder()
+        folder = self._jobs.new_folder()
         command = ["tools.cli.main", "recover", str(path), "--out", str(out)]
-        jobs.start("recover", f"recover {path.stem}", [command], folder)
+        self._jobs.start("recover", f"recover {path.stem}", [command], folder)
         return {"recording": out.stem}
 
-    async def span(request: Request) -> Any:
+    async def _span(self, request: Request) -> Any:
         """Cut a span out: for Mismatch as a recording beside the others, else as a file to take away."""
-        path, table = existing(request), await body(request)
+        path, table = self._existing(request), await body(request)
         kind = text(table, "to")
         from_s, to_s = (_time(table, key) for key in ("from_s", "to_s"))
         if from_s >= to_s:
@@ -209,36 +229,28 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         if kind not in (*FORMATS, *WHOLE):
             raise InputError(f"{kind!r} is not a format; there are {', '.join((*FORMATS, *WHOLE))}")
         title = f"{path.stem[:50]} {from_s:.2f}-{to_s:.2f} s"
-        folder = jobs.new_folder()
+        folder = self._jobs.new_folder()
         ending = SUFFIX if kind in WHOLE else f".{kind}"
-        out = recorder.path(title) if kind == "mismatch" else folder / f"{title}{ending}"
+        out = self._recorder.path(title) if kind == "mismatch" else folder / f"{title}{ending}"
         if out.is_symlink():
             raise InputError(f"{out} is a symbolic link; remove it first")
         times = ("--from", f"{from_s!r}", "--to", f"{to_s!r}", "--overwrite")
         raw = ("--raw",) if kind in WHOLE else ()
         command = ["tools.cli.main", "export", str(path), "--out", str(out), *raw, *times]
-        jobs.start("export", f"span of {path.stem}", [command], folder)
+        self._jobs.start("export", f"span of {path.stem}", [command], folder)
         return {"file": out.name, "recording": out.name if kind == "mismatch" else ""}
 
-    async def delete(request: Request) -> Any:
-        path = existing(request)
-        if recorder.active and path == recorder.path(recorder.name):
+    async def _delete(self, request: Request) -> Any:
+        path = self._existing(request)
+        if self._recorder.active and path == self._recorder.path(self._recorder.name):
             raise InputError("this recording is running; stop it first")
         if is_being_recorded(path):
             raise InputError(f"{path.stem!r} is being recorded by another process; stop it first")
         path.unlink()
         path.with_suffix(".json").unlink(missing_ok=True)
-        session.note("info", f"deleted {path.stem}")
+        self._session.note("info", f"deleted {path.stem}")
 
-    return [
-        Route("/api/recordings", clear(recordings)),
-        Route("/api/recording/start", clear(start), methods=["POST"]),
-        Route("/api/recording/stop", clear(stop), methods=["POST"]),
-        Route("/api/recording/note", clear(note), methods=["POST"]),
-        Route("/api/recordings/{name}/look", clear(look)),
-        Route("/api/recordings/{name}/file", clear(download)),
-        Route("/api/recordings/{name}/export", clear(export), methods=["POST"]),
-        Route("/api/recordings/{name}/recover", clear(recover), methods=["POST"]),
-        Route("/api/recordings/{name}/span", clear(span), methods=["POST"]),
-        Route("/api/recordings/{name}/delete", clear(delete), methods=["POST"]),
-    ]
+
+def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
+    """Return the routes of the Recordings view."""
+    return _Collect(session, jobs).routes()

@@ -31,64 +31,83 @@ def figures(run: Path) -> dict[str, Any]:
     }
 
 
-def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[BaseRoute]:
-    folder = session.recorder.folder
+class _Mismatch:
+    """Answers the requests of the Mismatch view: diagnose a recording, put its corrected twin on the bench, compare."""
 
-    def choices() -> dict[str, Path]:
-        files = {p.name: p for p in sorted(folder.glob(f"*{SUFFIX}")) if is_own_file(p)}
-        folders = (p.parent for p in sorted(folder.glob("*/recording.toml")))
+    def __init__(self, session: Session, jobs: Jobs, applied: Applied) -> None:
+        self._session = session
+        self._jobs = jobs
+        self._applied = applied
+        self._folder = session.recorder.folder
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the routes of the view."""
+        return [
+            Route("/api/mismatch", clear(self._recordings)),
+            Route("/api/mismatch/start", clear(self._start), methods=["POST"]),
+            Route("/api/mismatch/last-minute", clear(self._last_minute), methods=["POST"]),
+            Route("/api/mismatch/apply", clear(self._apply), methods=["POST"]),
+            Route("/api/mismatch/difference", clear(self._difference)),
+            *job_routes(self._jobs),
+        ]
+
+    def _choices(self) -> dict[str, Path]:
+        files = {p.name: p for p in sorted(self._folder.glob(f"*{SUFFIX}")) if is_own_file(p)}
+        folders = (p.parent for p in sorted(self._folder.glob("*/recording.toml")))
         own = (p for p in folders if not any(q.is_symlink() for q in (p, *p.iterdir())))
         return files | {f"{p.name}/": p for p in own}
 
-    async def recordings(_: Request) -> Any:
-        names = [*choices(), *([DEMONSTRATION] if session.bench.description.emulated_buses() else [])]
+    async def _recordings(self, _: Request) -> Any:
+        names = [*self._choices(), *([DEMONSTRATION] if self._session.bench.description.emulated_buses() else [])]
         return {
             "recordings": names,
-            "job": jobs.state("mismatch"),
-            "folder": str(folder),
-            "applied": applied.what,
-            "difference": jobs.state("difference"),
+            "job": self._jobs.state("mismatch"),
+            "folder": str(self._folder),
+            "applied": self._applied.what,
+            "difference": self._jobs.state("difference"),
         }
 
-    async def start(request: Request) -> Any:
+    async def _start(self, request: Request) -> Any:
         name = text(await body(request), "recording")
-        work = jobs.new_folder()
+        work = self._jobs.new_folder()
         steps: list[list[str]] = []
-        source = choices().get(name)
+        source = self._choices().get(name)
         if name == DEMONSTRATION:
             source = work / "stack"
-            bench = str(session.choice.bench)
+            bench = str(self._session.choice.bench)
             options = ("--profile", "sawtooth", "--seconds", "10", "--out", str(source))
             steps.append(["sim_devices.plant.lab", "piezo", "--bench", bench, *options])
         elif source is None:
-            raise InputError(f"there is no recording {name!r} in {folder}")
+            raise InputError(f"there is no recording {name!r} in {self._folder}")
         elif source.suffix == SUFFIX:
             out = str(work / "recording")
             steps.append(["tools.cli.main", "export", str(source), "--out", out])
             source = Path(out)
-        return diagnose(source, f"diagnose {name}", steps, work)
+        return self._diagnose(source, f"diagnose {name}", steps, work)
 
-    def diagnose(source: Path, title: str, steps: list[list[str]], work: Path) -> Any:
+    def _diagnose(self, source: Path, title: str, steps: list[list[str]], work: Path) -> Any:
         report = ("--html", str(work / "report.html"), "--json", str(work / "report.json"), "--jobs", "1")
         steps.append(["tools.cli.main", "mismatch", "diagnose", str(source), *report])
         twin = str(work / "twin.toml")
         steps.append(["tools.cli.main", "mismatch", "apply", str(source), str(work / "report.json"), "--out", twin])
-        return jobs.start("mismatch", title, steps, work).as_dict()
+        return self._jobs.start("mismatch", title, steps, work).as_dict()
 
-    async def last_minute(_: Request) -> Any:
+    async def _last_minute(self, _: Request) -> Any:
         """Diagnose what the watching twin saw last."""
-        jobs.must_be_idle()
-        work = jobs.new_folder()
-        source = await asyncio.to_thread(session.watch.write_last_minute, session.history, work / "recording")
-        return diagnose(source, "diagnose the last minute", [], work)
+        self._jobs.must_be_idle()
+        work = self._jobs.new_folder()
+        source = await asyncio.to_thread(
+            self._session.watch.write_last_minute, self._session.history, work / "recording"
+        )
+        return self._diagnose(source, "diagnose the last minute", [], work)
 
-    async def apply(_: Request) -> Any:
+    async def _apply(self, _: Request) -> Any:
         """The corrected twin in the place of the emulated stacks; then both benches in virtual time, side by side."""
-        twin = jobs.file("mismatch", "twin.toml")
-        jobs.must_be_idle()
-        choice = session.choice
-        after = await applied.twin(twin)
-        work = jobs.new_folder()
+        twin = self._jobs.file("mismatch", "twin.toml")
+        self._jobs.must_be_idle()
+        choice = self._session.choice
+        after = await self._applied.twin(twin)
+        work = self._jobs.new_folder()
         same = ["--virtual", "--seconds", f"{SECONDS:g}"]
         if choice.hand_file:
             same += ["--hand", choice.hand_file]
@@ -98,25 +117,21 @@ def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[Base
         for name, bench in (("before", choice.bench), ("after", after)):
             files = ("--json", str(work / f"{name}.json"), "--picture", str(work / f"{name}.png"))
             steps.append(["tools.cli.main", "run", "--bench", str(bench), *same, *files])
-        return jobs.start("difference", "both benches in virtual time", steps, work).as_dict()
+        return self._jobs.start("difference", "both benches in virtual time", steps, work).as_dict()
 
-    async def difference(_: Request) -> Any:
+    async def _difference(self, _: Request) -> Any:
         """Return the available figures on the emulated truth, without and with the corrected twin."""
-        job = jobs.state("difference")
+        job = self._jobs.state("difference")
         result: dict[str, Any] = {"job": job}
         for name in ("before", "after"):
             if f"{name}.json" in job.get("files", ()):
-                result[name] = figures(jobs.file("difference", f"{name}.json"))
+                result[name] = figures(self._jobs.file("difference", f"{name}.json"))
         return result
 
-    return [
-        Route("/api/mismatch", clear(recordings)),
-        Route("/api/mismatch/start", clear(start), methods=["POST"]),
-        Route("/api/mismatch/last-minute", clear(last_minute), methods=["POST"]),
-        Route("/api/mismatch/apply", clear(apply), methods=["POST"]),
-        Route("/api/mismatch/difference", clear(difference)),
-        *job_routes(jobs),
-    ]
+
+def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[BaseRoute]:
+    """Return the routes of the Mismatch view."""
+    return _Mismatch(session, jobs, applied).routes()
 
 
 def job_routes(jobs: Jobs) -> list[BaseRoute]:
