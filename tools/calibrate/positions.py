@@ -25,7 +25,7 @@ from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
 from hal.types import STANDARD_GRAVITY
 from tools.calibrate.multi_position import Estimate
-from tools.calibrate.pivot_spline import Step, gauss_newton, uniform_basis
+from tools.calibrate.pivot_spline import Basis, Step, gauss_newton, uniform_basis
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -166,32 +166,79 @@ class _Problem:
         return by_curve, by_global
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """Holds the end of the iteration: curves' ``coefficients``, globals ``x``, ``noise`` (N + 3,) per column, residuals
+    (n, N + 3), and the last step."""
+
+    coefficients: Array
+    x: Array
+    noise: Array
+    residual: Array
+    step: Step
+
+
 def fit_positions(readings: Array, field: Array, rate_hz: float, config: SensingConfig) -> PositionFit:
-    """Places from readings (n, N) m/s^2 and field (n, 3) uT of a swing. ``InputError`` says what is wrong with it."""
+    """Fit the places from readings (n, N) m/s^2 and field (n, 3) uT of a swing. ``InputError`` says what is wrong with
+    the recording."""
     seconds = len(readings) / rate_hz
     if seconds < SHORTEST_S or rate_hz < 2.0 * FIT_HZ:
         raise InputError(f"{seconds:.1f} s at {rate_hz:g} Hz: swing for a minute, sampled at {2 * FIT_HZ:g} Hz or more")
     problem, t = _prepare(readings, field, rate_hz, config)
     basis = uniform_basis(t, KNOT_S)
     believed = np.array(config.positions_m)
-    n, k = len(problem.axes), believed.size
-    x = np.zeros(k + 5 * n + 3)
-    x[:k] = believed.ravel()
+    k = believed.size
+    solved = _solve(problem, basis, basis.fit(_first_angles(problem, config)), believed)
+    step, n = solved.step, len(problem.axes)
+    curves = basis.curves(solved.coefficients)
+    omega = problem.motion(curves)[2]
+    variance = _variance(step, solved.residual / solved.noise[None, :], round(BLOCK_S * FIT_HZ))
+    force = problem.force(curves, problem.split(solved.x)["places"])
+    variance += _bent(step, force / problem.gravity, solved.noise)
+    blocks = int(seconds / BLOCK_S)
+    reach = float(student.ppf(0.975, max(2, blocks - 1))) * np.sqrt(variance[:k])
+    size = np.sqrt(np.diag(step.information))
+    fit = PositionFit(
+        solved.x[:k].reshape(-1, 3),
+        reach.reshape(-1, 3),
+        believed,
+        float(np.sqrt(np.mean(solved.residual[:, :n] ** 2))),
+        float(np.linalg.cond(step.information / np.outer(size, size)) ** 0.5),
+        seconds,
+        float(np.sqrt(np.mean(np.sum(omega**2, axis=1)))),
+        tuple(str(i + 1) for i in range(len(believed))),
+    )
+    _refuse(fit)
+    return fit
+
+
+def _start(problem: _Problem, basis: Basis, coefficients: Array, believed: Array) -> tuple[Array, Array]:
+    """Return the globals to begin with, and the inverse variances of their priors; 0 means that there is none."""
+    x = np.zeros(believed.size + 5 * len(problem.axes) + 3)
+    x[: believed.size] = believed.ravel()
     prior = np.zeros(len(x))
     for name, part in problem.split(np.arange(len(x), dtype=np.float64)).items():
         if name in EXPECTED:
             prior[part.astype(np.intp)] = EXPECTED[name] ** -2
-    coefficients = basis.fit(_first_angles(problem, config))
     up, north, _, _ = problem.motion(basis.curves(coefficients))
-    earth = slice(len(x) - 3, len(x) - 1)
-    x[earth] = [np.mean(np.sum(problem.field * north, axis=1)), np.mean(np.sum(problem.field * up, axis=1))]
+    x[_earth(x)] = [np.mean(np.sum(problem.field * north, axis=1)), np.mean(np.sum(problem.field * up, axis=1))]
+    return x, prior
+
+
+def _earth(x: Array) -> slice:
+    return slice(len(x) - 3, len(x) - 1)
+
+
+def _solve(problem: _Problem, basis: Basis, coefficients: Array, believed: Array) -> _Solved:
+    """Run Gauss-Newton on curves and globals from the drawing's places until these stand still."""
+    n, k = len(problem.axes), believed.size
+    x, prior = _start(problem, basis, coefficients, believed)
+    field_size = float(np.linalg.norm(x[_earth(x)]))
     noise = np.full(n + 3, 0.02)
-    field_size = float(np.linalg.norm(x[earth]))
     noise[n:] = FIELD_ERROR * field_size
     measured = np.hstack([problem.readings, problem.field])
     expected = np.where(prior > 0.0, 0.0, x)
     step: Step | None = None
-    residual = measured
     for iteration in range(ITERATIONS):
         curves = basis.curves(coefficients)
         by_curve, by_global = problem.slopes(curves, x)
@@ -212,27 +259,7 @@ def fit_positions(readings: Array, field: Array, rate_hz: float, config: Sensing
         if iteration > 3 and np.max(np.abs(step.globals_[:k])) < 1e-8:
             break
     assert step is not None
-    residual = measured - problem.predict(basis.curves(coefficients), x)
-    curves = basis.curves(coefficients)
-    omega = problem.motion(curves)[2]
-    variance = _variance(step, residual / noise[None, :], round(BLOCK_S * FIT_HZ))
-    variance += _bent(step, problem.force(curves, problem.split(x)["places"]) / problem.gravity, noise)
-    blocks = int(seconds / BLOCK_S)
-    reach = float(student.ppf(0.975, max(2, blocks - 1))) * np.sqrt(variance[:k])
-    size = np.sqrt(np.diag(step.information))
-    names = tuple(str(i + 1) for i in range(len(believed)))
-    fit = PositionFit(
-        x[:k].reshape(-1, 3),
-        reach.reshape(-1, 3),
-        believed,
-        float(np.sqrt(np.mean(residual[:, :n] ** 2))),
-        float(np.linalg.cond(step.information / np.outer(size, size)) ** 0.5),
-        seconds,
-        float(np.sqrt(np.mean(np.sum(omega**2, axis=1)))),
-        names,
-    )
-    _refuse(fit)
-    return fit
+    return _Solved(coefficients, x, noise, measured - problem.predict(basis.curves(coefficients), x), step)
 
 
 def _refuse(fit: PositionFit) -> None:
