@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 
@@ -432,6 +432,15 @@ class ForceCode:
     lean: str = ""
     radii: str = ""
     springs: str = ""
+
+
+def joined(codes: Sequence[ForceCode]) -> ForceCode:
+    """Return the forces at one place as one: sums, and the memory of the force that has one."""
+    limit, stiff = (" + ".join(part for c in codes if (part := getattr(c, name))) for name in ("limit", "stiff"))
+    lean, radii, springs = (
+        next((part for c in codes if (part := getattr(c, name))), "") for name in ("lean", "radii", "springs")
+    )
+    return ForceCode("".join(c.smooth for c in codes), limit, stiff, lean, radii, springs)
 
 
 def _friction(s: Slot) -> ForceCode:

@@ -37,7 +37,7 @@ from tools.guest.equations import (
     TANH,
     Program,
 )  # fmt: skip
-from tools.mismatch.export.effects import ForceCode, Slot, force, numbers
+from tools.mismatch.export.effects import ForceCode, Slot, force, joined, numbers
 from tools.mismatch.export.motion import bend_code, sum_code
 from tools.mismatch.twins.equations import Place, Programs
 from tools.mismatch.twins.ode import OdeTwin
@@ -242,30 +242,36 @@ class EquationLines:
         return pushes, self._moving(at[special[0]], by[special[0]])
 
     def _moving(self, place: Place | None, codes: Sequence[ForceCode]) -> list[str]:
-        limits = " + ".join(c.limit for c in codes if c.limit)
-        stiff = " + ".join(c.stiff for c in codes if c.stiff)
-        lean = next((c.lean for c in codes if c.lean), "")
-        radii = next((c.radii for c in codes if c.radii), "")
-        springs = next((c.springs for c in codes if c.springs), "")
-        memory = ["s", "before", "began"]
-        lines: list[str] = []
-        gain = numbers(self.gains[place.name]) if place is not None else "1.0"
-        if place is not None and radii:
-            memory.append("held")
-            lines.append(f"radii, springs = np.array({radii}), np.array({springs})")
+        """Return the lines of ``moving(t, drive)``. ``codes``: the forces at ``place`` that a Runge-Kutta step alone
+        cannot take, because they stick or remember."""
+        found = joined(codes)
+        names, lines = self._memory(place, found)
+        lines += ["", "def step(t, s, ua, ub, uc):  # Runge and Kutta, fourth order", *self._step(place, found)]
+        return [*lines, "", "def moving(t, drive):", f"    nonlocal {', '.join(names)}", *self._course(place, found)]
+
+    def _memory(self, place: Place | None, found: ForceCode) -> tuple[list[str], list[str]]:
+        """Return the names that keep their values from step to step, and the lines that define them and the forces."""
+        names, lines = ["s", "before", "began"], list[str]()
+        if place is None:
+            return names, lines
+        gain = numbers(self.gains[place.name])
+        if found.radii:
+            names.append("held")
+            lines.append(f"radii, springs = np.array({found.radii}), np.array({found.springs})")
             lines.append(f"held = s[{place.position}] + 0 * radii  # where each elastic element is at rest")
-        if limits:
-            lines += ["", "def limit(v, sign):", f"    return {gain} * ({limits})"]
-        since = ", since" if stiff else ""
-        if place is not None and stiff:
-            memory.append("bristle")
-            lines += [
-                f"stiff, bristle = {gain} * ({stiff}), 0.0", "",
-                *bend_code(lean, "def bend(z, v, since):", "since"),
-            ]  # fmt: skip
-        lines += ["", "def step(t, s, ua, ub, uc):  # Runge and Kutta, fourth order"]
-        slope = "derivatives"
-        if place is not None and stiff:
+        if found.limit:
+            lines += ["", "def limit(v, sign):", f"    return {gain} * ({found.limit})"]
+        if found.stiff:
+            names.append("bristle")
+            bend = bend_code(found.lean, "def bend(z, v, since):", "since")
+            lines += [f"stiff, bristle = {gain} * ({found.stiff}), 0.0", "", *bend]
+        return names, lines
+
+    def _step(self, place: Place | None, found: ForceCode) -> list[str]:
+        """Return the body of ``step``, which returns the states a step ``h`` later."""
+        sticks = place is not None and bool(found.limit) and not found.stiff
+        lines: list[str] = []
+        if place is not None and found.stiff:
             i = place.velocity
             lines += [
                 "    def slope(t, s_, u, since):",
@@ -273,8 +279,7 @@ class EquationLines:
                 f"        rates[{i}] -= stiff * bend(bristle, 0.5 * (s[{i}] + s_[{i}]), since)",
                 "        return rates", "",
             ]  # fmt: skip
-            slope = "slope"
-        elif place is not None and limits:
+        elif place is not None and sticks:
             i = place.velocity
             lines += [
                 f"    v, push = s[{i}], derivatives(t, s, ua)[{i}]",
@@ -285,8 +290,8 @@ class EquationLines:
                 f"        rates[{i}] = 0.0 if stuck else rates[{i}] - sign * max(limit(s[{i}], sign), 0.0)",
                 "        return rates", "",
             ]  # fmt: skip
-            slope = "slope"
-        ends = [f", {part}" if since else "" for part in ("0.0", "h / 2", "h / 2", "h")]
+        slope = "slope" if lines else "derivatives"
+        ends = [f", {part}" if found.stiff else "" for part in ("0.0", "h / 2", "h / 2", "h")]
         lines += [
             f"    a = {slope}(t, s, ua{ends[0]})",
             f"    b = {slope}(t + h / 2, s + h / 2 * a, ub{ends[1]})",
@@ -294,7 +299,7 @@ class EquationLines:
             f"    d = {slope}(t + h, s + h * c, uc{ends[3]})",
             "    z = s + h / 6 * (a + 2 * b + 2 * c + d)",
         ]
-        if place is not None and limits and not stiff:
+        if place is not None and sticks:
             i = place.velocity
             lines += [
                 f"    if stuck or z[{i}] * sign < 0:  # does the rest of the step move it again?",
@@ -306,34 +311,43 @@ class EquationLines:
                 "        part = 0.5 * min(over / (abs(after - push) or 1.0), 1.0) if stuck else 1.0 - crossed",
                 f"        z[{i}] = np.sign(after) * max(over, 0.0) * part * h",
             ]
-        lines += ["    return z", "", "def moving(t, drive):", f"    nonlocal {', '.join(memory)}"]
-        lines += ["    out = np.empty((len(drive), len(s)))", "    for k, now in enumerate(drive):"]
+        return [*lines, "    return z"]
+
+    def _course(self, place: Place | None, found: ForceCode) -> list[str]:
+        """Return the body of ``moving``, which returns the states at every sample of ``drive``."""
         again = f"for j in range({self.substeps} if before is not None else 0):"
-        lines.append(f"        {'if before is not None:' if self.substeps == 1 else again}")
-        held = [bool(h) for h, s in zip(self.twin.held, self.twin.signals, strict=True) if s in self.signals]
-        start = "began" if self.substeps == 1 else "began + j * h"
-        if np.all(held):
-            body = [f"z = step({start}, s, before, before, before)"]
-        else:
-            end = "end" if any(held) else "now"
-            body = [f"end = np.where({held}, before, now)  # inputs that are held"] if any(held) else []
-            if self.substeps == 1:
-                body.append(f"z = step({start}, s, before, (before + {end}) / 2, {end})")
-            else:
-                part = f"(j + c) / {self.substeps} * ({end} - before)"
-                body.append(f"ua, ub, uc = (before + {part} for c in (0, 0.5, 1))")
-                body.append(f"z = step({start}, s, ua, ub, uc)")
-        if place is not None and stiff:
+        head = "if before is not None:" if self.substeps == 1 else again
+        body = self._one_step()
+        if place is not None and found.stiff:
             i = place.velocity
             body.append(f"bristle = bend(bristle, 0.5 * (s[{i}] + z[{i}]), h)")
-        if place is not None and radii:
+        if place is not None and found.radii:
             body.append(f"held = np.clip(held, z[{place.position}] - radii, z[{place.position}] + radii)")
         low = [s.lowest for s in self.twin.state_list]
         high = [s.highest for s in self.twin.state_list]
         bounded = np.any(np.isfinite(low)) or np.any(np.isfinite(high))
         body.append(f"s = np.clip(z, {_bounds(low)}, {_bounds(high)})" if bounded else "s = z")
-        lines += ["            " + line for line in body]
-        return [*lines, "        before, began, out[k] = now, t[k], s", "    return out"]
+        return [
+            "    out = np.empty((len(drive), len(s)))",
+            "    for k, now in enumerate(drive):",
+            f"        {head}",
+            *("            " + line for line in body),
+            "        before, began, out[k] = now, t[k], s",
+            "    return out",
+        ]
+
+    def _one_step(self) -> list[str]:
+        """Return the lines that take ``z`` a step further, with each input held or straight between its samples."""
+        held = [bool(h) for h, s in zip(self.twin.held, self.twin.signals, strict=True) if s in self.signals]
+        start = "began" if self.substeps == 1 else "began + j * h"
+        if np.all(held):
+            return [f"z = step({start}, s, before, before, before)"]
+        end = "end" if any(held) else "now"
+        lines = [f"end = np.where({held}, before, now)  # inputs that are held"] if any(held) else []
+        if self.substeps == 1:
+            return [*lines, f"z = step({start}, s, before, (before + {end}) / 2, {end})"]
+        part = f"(j + c) / {self.substeps} * ({end} - before)"
+        return [*lines, f"ua, ub, uc = (before + {part} for c in (0, 0.5, 1))", f"z = step({start}, s, ua, ub, uc)"]
 
 
 def _bounds(values: Sequence[float]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array
-from tools.mismatch.export.effects import ForceCode
+from tools.mismatch.export.effects import ForceCode, joined
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View, view_run
@@ -54,69 +54,91 @@ def motion(codes: Sequence[ForceCode], plant: PlantCode, substeps: int) -> list[
 
     The scheme is that of ``twins.feedback.run_feedback``, written out for the forces of the twin.
     """
-    smooth = "".join(c.smooth for c in codes)
-    limits = [c.limit for c in codes if c.limit]
-    stiff = " + ".join(c.stiff for c in codes if c.stiff)
-    lean = next((c.lean for c in codes if c.lean), "")
-    radii = next((c.radii for c in codes if c.radii), "")
-    springs = next((c.springs for c in codes if c.springs), "")
-    straight = plant.hold == "'linear'"
-    step = "dt" if substeps == 1 else f"dt / {substeps}"
+    found = joined(codes)
+    names, lines = _memory(found, plant, "dt" if substeps == 1 else f"dt / {substeps}")
+    steps = "if before is not None:" if substeps == 1 else f"for j in range({substeps} if before is not None else 0):"
+    return [
+        *lines,
+        "",
+        "def moving(drive):",
+        f"    nonlocal {', '.join(names)}",
+        "    out = np.empty((len(drive), len(s)))",
+        "    for k, now in enumerate(drive):",
+        f"        {steps}",
+        *("            " + line for line in _step(found, plant.hold == "'linear'", substeps)),
+        "        before, out[k] = now, s",
+        "    return out",
+    ]
+
+
+def _memory(found: ForceCode, plant: PlantCode, step: str) -> tuple[list[str], list[str]]:
+    """Return the names that keep their values from step to step, and the lines that define them and the forces."""
+    names = ["s", "before"]
     lines = [
         f"ad, g0, g1 = discretise({plant.a}, {plant.b}, {step}, {plant.hold})",
         f"g0, g1, place, speed = g0[:, 0], g1[:, 0], {plant.place}, {plant.speed}  # rows of position and velocity",
         f"s, before = {plant.start}, None",
     ]
-    terms, later = (["smooth(place @ s, speed @ s)"], ["smooth(place @ z, speed @ z)"]) if smooth else ([], [])
-    memory = ["s", "before"]
-    if radii:
-        memory.append("held")
-        lines.append(f"radii, springs = np.array({radii}), np.array({springs})")
+    if found.radii:
+        names.append("held")
+        lines.append(f"radii, springs = np.array({found.radii}), np.array({found.springs})")
         lines.append("held = place @ s + 0 * radii  # where each elastic element is at rest")
-        terms.append("- springs @ (place @ s - held)")
-        later.append("- springs @ np.clip(place @ z - held, -radii, radii)")
-    if stiff:
-        memory.append("bristle")
-        lines.append(f"stiff, bristle = {stiff}, 0.0")
-        terms.append("- stiff * bristle")
-        later.append("- stiff * bend(bristle, 0.5 * speed @ (s + z))")
-    if limits:
-        lines += ["", "def limit(v, sign):", f"    return max({' + '.join(limits)}, 0.0)"]
-    if stiff:
-        lines += ["", *bend_code(lean, "def bend(z, v):", step)]
-    if smooth:
-        lines += ["", "def smooth(x, v):", f"    return {sum_code(smooth.strip())}"]
-    lines += ["", "def moving(drive):", f"    nonlocal {', '.join(memory)}", "    out = np.empty((len(drive), len(s)))"]
-    steps = "if before is not None:" if substeps == 1 else f"for j in range({substeps} if before is not None else 0):"
-    lines += ["    for k, now in enumerate(drive):", f"        {steps}"]
+    if found.stiff:
+        names.append("bristle")
+        lines.append(f"stiff, bristle = {found.stiff}, 0.0")
+    if found.limit:
+        lines += ["", "def limit(v, sign):", f"    return max({found.limit}, 0.0)"]
+    if found.stiff:
+        lines += ["", *bend_code(found.lean, "def bend(z, v):", step)]
+    if found.smooth:
+        lines += ["", "def smooth(x, v):", f"    return {sum_code(found.smooth.strip())}"]
+    return names, lines
+
+
+def _step(found: ForceCode, straight: bool, substeps: int) -> list[str]:
+    """Return the lines that take the state ``s`` a step further. ``straight``: the input runs straight in it."""
+    now, next_ = _terms(found)
     if straight:
         rise = "now - before" if substeps == 1 else f"(now - before) / {substeps}"
         body = [f"rise = {rise}", f"u = before{'' if substeps == 1 else ' + j * rise'}"]
         plus = "u + rise"
     else:
         body, plus = ["u = before"], "u"
-    if radii:
+    if found.radii:
         body.append("held = np.clip(held, place @ s - radii, place @ s + radii)")
-    if terms:
+    if now:
         body += [
-            f"f = {sum_code(' '.join(terms))}",
+            f"f = {sum_code(' '.join(now))}",
             f"z = ad @ s + g0 * (u + f) + g1 * ({plus} + f)",
-            f"g = {sum_code(' '.join(later))}",
+            f"g = {sum_code(' '.join(next_))}",
             f"z = ad @ s + g0 * (u + f) + g1 * ({plus} + g)",
         ]
     else:
         body.append(f"z = ad @ s + g0 * u + g1 * ({plus})")
-    if stiff:
+    if found.stiff:
         body.append("bristle = bend(bristle, 0.5 * speed @ (s + z))")
-    elif limits:
+    elif found.limit:
         body += [
             "v, push = speed @ z, speed @ (g0 + g1)",
             "most = limit(speed @ s, 1.0 if v > 0 else -1.0)  # dry friction takes no more than stops the motion",
             "z = z - (g0 + g1) * (np.sign(v) * most if abs(v) > most * push else v / push)",
         ]
-    body.append("s = z")
-    lines += ["            " + line for line in body]
-    return [*lines, "        before, out[k] = now, s", "    return out"]
+    return [*body, "s = z"]
+
+
+def _terms(found: ForceCode) -> tuple[list[str], list[str]]:
+    """Return the code of each force at the start of a step, and at its end."""
+    now, next_ = list[str](), list[str]()
+    if found.smooth:
+        now.append("smooth(place @ s, speed @ s)")
+        next_.append("smooth(place @ z, speed @ z)")
+    if found.radii:
+        now.append("- springs @ (place @ s - held)")
+        next_.append("- springs @ np.clip(place @ z - held, -radii, radii)")
+    if found.stiff:
+        now.append("- stiff * bristle")
+        next_.append("- stiff * bend(bristle, 0.5 * speed @ (s + z))")
+    return now, next_
 
 
 def bend_code(lean: str, head: str, since: str) -> list[str]:
