@@ -19,14 +19,24 @@ VirtualOption = Annotated[
     bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
 ]
 RealtimeOption = Annotated[
-    bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
+    bool,
+    typer.Option(
+        "--realtime", help="Emulated bench: run on the wall clock, with the devices in processes of their own."
+    ),
 ]
 HandOption = Annotated[
-    str | None, typer.Option("--hand", metavar="FILE", help="A recorded hand instead of the synthetic one.")
+    str | None,
+    typer.Option(
+        "--hand",
+        metavar="FILE",
+        help="Recorded hand that moves the emulated instrument, in place of the synthetic one.",
+    ),
 ]
 ScaleOption = Annotated[
     float | None,
-    typer.Option("--scale", help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
+    typer.Option(
+        "--scale", help="With --hand: factor on its motion; by default its tremor (8-12 Hz) becomes 50 um p-p."
+    ),
 ]
 SeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of the emulated world; default from the bench file.")

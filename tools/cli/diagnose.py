@@ -19,7 +19,7 @@ from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 from tools.terminal import table_of
 
-YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
+YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask before devices are touched.")]
 
 
 TURN_S = 60.0
@@ -48,7 +48,9 @@ def _ask(question: str, yes: bool) -> None:
 
 def scan(
     bench: BenchOption = None,
-    probe: Annotated[ProbeChoice, typer.Option(help="Method of asking an I2C address.")] = ProbeChoice.READ,
+    probe: Annotated[
+        ProbeChoice, typer.Option(help="Transaction that asks an I2C address: read a byte, or write none.")
+    ] = ProbeChoice.READ,
     seconds: Annotated[float, typer.Option(min=0.0, max=3600.0, help="Time of listening to CAN, in s.")] = 1.0,
     yes: YesOption = False,
     virtual: VirtualOption = False,

@@ -53,14 +53,14 @@ def run(
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="Time of the run after arming, in s.")] = 10.0,
     virtual: Annotated[
-        bool, typer.Option("--virtual", help="Emulated bench: as fast as it can instead of a second per second.")
+        bool, typer.Option("--virtual", help="Emulated bench: run as fast as possible, not a second per second.")
     ] = False,
     realtime: RealtimeOption = False,
     compiled: Annotated[
         bool, typer.Option("--compiled", help="Run the ticks in one compiled thread without the interpreter.")
     ] = False,
     spin_us: Annotated[
-        float, typer.Option(min=0.0, help="With --compiled: wait awake for so many us before and after a scan is due.")
+        float, typer.Option(min=0.0, help="With --compiled: poll without sleeping for so many us around each scan.")
     ] = 0.0,
     cpu: Annotated[
         int | None, typer.Option(min=0, help="In real time: the processor that the loop stays on (isolcpus).")
@@ -72,7 +72,10 @@ def run(
     ] = False,
     manual: Annotated[
         Path | None,
-        typer.Option(metavar="PROGRAM.toml", help="The outputs play it instead of compensating; runs to its end."),
+        typer.Option(
+            metavar="PROGRAM.toml",
+            help="Voltage program that the outputs play, to its end, in place of the compensation.",
+        ),
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
     watch: WatchOption = None,
@@ -95,10 +98,10 @@ def run(
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
     json_file: JsonOption = None,
-    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) before and after.")] = Path(
-        "out/run.png"
-    ),
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a self-contained HTML report.")] = None,
+    image: Annotated[
+        Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the tip without and with compensation.")
+    ] = Path("out/run.png"),
 ) -> None:
     """Run the instrument in closed loop and report what was left of the tremor.
 

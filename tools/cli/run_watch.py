@@ -26,12 +26,14 @@ SHORTEST_S, LONGEST_S = 15.0, 3600.0
 WatchOption = Annotated[
     Path | None,
     typer.Option(
-        metavar="TWIN.toml", help="A corrected twin runs beside the instrument and says when reality leaves it."
+        metavar="TWIN.toml", help="Corrected twin that runs beside the instrument; you are told when reality leaves it."
     ),
 ]
 ReferenceOption = Annotated[
     float | None,
-    typer.Option(metavar="S", help=f"With --watch: first part, in which the twin is good; default {REFERENCE_S:g} s."),
+    typer.Option(
+        metavar="S", help=f"With --watch: length of the first part, in which the twin is good; default {REFERENCE_S:g}."
+    ),
 ]
 RateOption = Annotated[
     float | None,
