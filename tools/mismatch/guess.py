@@ -13,7 +13,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,17 +119,7 @@ def guess(path: Path, kind: str = "") -> Guess:
 
     Raises RecordingError.
     """
-    if own_recording(path) is not None:
-        raise RecordingError(
-            f"{path}: a recording of micron run; 'micron export {path} FOLDER' writes it with its twin and bench"
-        )
-    names = column_names(path)
-    if not names:
-        raise RecordingError(
-            f"{path}: no columns of numbers; a csv needs lines of numbers, an npz one array per column"
-        )
-    if len(names) > MOST_COLUMNS:
-        raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
+    names = _names(path)
     file_units = column_units(path)
     parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else split_unit(k) for k in names}
     words = words_in(path)
@@ -163,6 +153,18 @@ def guess(path: Path, kind: str = "") -> Guess:
     bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
     if bare:
         assumed.append("units: " + ", ".join(f"'{k}' in {_assumed_unit(kind, found, k) or '1'}" for k in bare))
+    columns = [
+        GuessedColumn(
+            k,
+            found.roles.get(k, ""),
+            found.signals.get(k, ""),
+            parts[k][1],
+            *_drawn(seen[k]),
+            seen[k].missing,
+            seen[k].first_missing,
+        )
+        for k in names
+    ]
     broken = [
         f"column '{k}' has {seen[k].missing} missing values, the first at {place(seen[k].first_missing, row)}"
         for k in left
@@ -177,19 +179,25 @@ def guess(path: Path, kind: str = "") -> Guess:
         time_column, rate_hz = clock, _rate_beside({**constants, **read_scalars(path)}, notes)
         if rate_hz is None:
             unknown.append("the rate: no column is a time that runs forwards; set rate_hz, or repeat with --rate HZ")
-    columns = [
-        GuessedColumn(
-            k,
-            ("time" if k == time_column else "") if k == clock else found.roles.get(k, ""),
-            found.signals.get(k, "t" if k == clock else ""),
-            parts[k][1],
-            *_drawn(seen[k]),
-            seen[k].missing,
-            seen[k].first_missing,
-        )
-        for k in names
-    ]
+    as_clock = {"role": "time" if clock == time_column else "", "signal": found.signals.get(clock, "t")}
+    columns = [replace(c, **as_clock) if c.name == clock else c for c in columns]
     return Guess(n, time_column, rate_hz, kind, columns, unknown, broken, assumed, notes, clock, clock_unit, row)
+
+
+def _names(path: Path) -> list[str]:
+    """Return the names of the columns of numbers. Raises RecordingError for a file that cannot be described."""
+    if own_recording(path) is not None:
+        raise RecordingError(
+            f"{path}: a recording of micron run; 'micron export {path} FOLDER' writes it with its twin and bench"
+        )
+    names = column_names(path)
+    if not names:
+        raise RecordingError(
+            f"{path}: no columns of numbers; a csv needs lines of numbers, an npz one array per column"
+        )
+    if len(names) > MOST_COLUMNS:
+        raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
+    return names
 
 
 def _time_of(clock: str, unit: str, stamps: Stamps, broken: list[str], notes: list[str]) -> tuple[str, float | None]:
