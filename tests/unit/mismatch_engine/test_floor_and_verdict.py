@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
@@ -89,6 +90,25 @@ def test_stretches_at_rest_see_it_too(seed: int) -> None:
     assert found is not None
     assert found[0] == pytest.approx(NOISE_UM, rel=0.25)
     assert rest_floor(y, 50 + 40 * wave(rng, u.size)[:, None]) is None
+
+
+def test_an_output_that_still_rings_at_rest_is_no_noise() -> None:
+    """A lightly damped stage between steps: what a free run of the right twin leaves bounds the noise."""
+    rng, dt, noise = np.random.default_rng(14), 1 / RATE, 2e-3
+    u = np.repeat(rng.uniform(-1.0, 1.0, N // 200), 200)
+    a = np.array([[0.0, 1.0], [-(300.0**2), -2 * 0.02 * 300.0]])
+    step = expm(np.block([[a, np.array([[0.0], [300.0**2]])], [np.zeros((1, 3))]]) * dt)
+    x, y = np.zeros(2), np.empty(N)
+    for k in range(N):
+        y[k] = x[0]
+        x = step[:2, :2] @ x + step[:2, 2] * u[k]
+    believed = {"A": a.tolist(), "B": [[0.0], [300.0**2]], "C": [[1.0, 0.0]], "hold": "zero"}
+    rec = recording("state_space", {"command": u}, {"displacement": y + noise * rng.standard_normal(N)}, believed)
+    problem, raw, _ = prepared(rec, 0.3, 0, False)
+    loud = replace(problem.floors["displacement"], rms=30 * noise, method="rest")
+    quieter = problem.with_floors({"displacement": loud}).quieter(raw.residual)
+    assert quieter.sigma("displacement") == pytest.approx(noise, rel=0.1)
+    assert quieter.quieter({"displacement": 2 * raw.residual["displacement"]}) is quieter
 
 
 def test_a_declared_resolution_is_the_least_noise() -> None:

@@ -161,16 +161,21 @@ class Problem:
         floors = dict(self.floors)
         spans = sorted(self.held_spans, key=lambda s: s[0] - s[1])[:6]
         for o, old in self.floors.items():
-            if old.method != "spectrum" or o not in residual:
+            if old.method not in ("spectrum", "rest") or o not in residual:
                 continue
-            found = [spectral_floor(residual[o][a:b], 1 / self.recording.dt) for a, b in spans if b - a >= 128]
-            sizes = [float(b - a) for a, b in spans if b - a >= 128]
-            if not found:
-                continue
-            rms = float(np.sqrt(np.average([f[0] ** 2 for f in found], weights=sizes)))
-            if old.step > 0:
-                # readings on a grid: noise shows as the readings that fell on the other side of an edge
-                rms = max(rms, min(old.step / np.sqrt(12.0), float(np.std(residual[o][self.held_rows]))))
+            left = float(np.sqrt(np.mean(residual[o][self.held_rows] ** 2)))
+            if old.method == "rest":
+                # the output may still have moved there; what a free run leaves on other samples bounds any noise
+                rms = max(left, old.step / np.sqrt(12.0))
+            else:
+                found = [spectral_floor(residual[o][a:b], 1 / self.recording.dt) for a, b in spans if b - a >= 128]
+                sizes = [float(b - a) for a, b in spans if b - a >= 128]
+                if not found:
+                    continue
+                rms = float(np.sqrt(np.average([f[0] ** 2 for f in found], weights=sizes)))
+                if old.step > 0:
+                    # readings on a grid: noise shows as the readings that fell on the other side of an edge
+                    rms = max(rms, min(old.step / np.sqrt(12.0), left))
             if rms < 0.95 * old.rms:
                 floors[o] = replace(old, rms=rms, white_rms=min(old.white_rms, rms))
         return self.with_floors(floors) if floors != dict(self.floors) else self
