@@ -105,12 +105,12 @@ def test_a_motor_that_nobody_has_seen_gets_no_wrong_name(drawn: Path, variant: s
     assert row["judged"] not in ("wrong", "failed"), row
 
 
-def test_a_delay_of_the_command_is_met_inside_equations(tmp_path: Path) -> None:
-    """Stretches that start from measured angles know nothing of a delay behind the motor: it is tried before it."""
+def test_a_delay_of_the_command_is_met_by_equations(tmp_path: Path) -> None:
+    """A late command and a late sensor look alike behind a linear motor; stretches start from angles that were late."""
     subprocess.run([sys.executable, "make.py", str(tmp_path), "delay"], cwd=EXAMPLE, check=True, timeout=300)
     found = best_of(tmp_path / "delay" / "ode.toml", "dead_time")
     assert found.left < 1.3
-    assert (found.place.site, found.place.target) == ("input", "command")
+    assert (found.place.site, found.place.target) in [("input", "command"), ("output", "angle")]
     assert found.human[0].value == pytest.approx(0.04, rel=0.02)
 
 

@@ -194,13 +194,13 @@ def columns(recording: Recording, simulated: Mapping[str, Array]) -> str:
     table = {recording.column[s]: found[s] for s in recording.inputs}
     table |= {recording.column[o]: y for o, y in measured.items()}
     table |= {f"{recording.column[o]}_simulated": y for o, y in simulated.items()}
-    return _csv(["t_s", *table], [recording.t, *table.values()])
+    # a time in steps of 0.05 s is written as such
+    return _csv(["t_s", *table], [np.round(recording.t, 12), *table.values()])
 
 
 def _csv(header: Sequence[str], values: Sequence[Array]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(header)
-    # twelve digits: a time in steps of 0.05 s is written as such
-    writer.writerows(zip(*([f"{x:.12g}" for x in v.tolist()] for v in values), strict=True))
+    writer.writerows(zip(*(v.tolist() for v in values), strict=True))
     return out.getvalue()
