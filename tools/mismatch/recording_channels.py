@@ -107,7 +107,8 @@ def _unit(at: str, value: object, allowed: tuple[str, ...], signal: str, notes: 
     try:
         parsed = units.parse(value)
     except units.UnitError as error:
-        raise RecordingError(f"{at}: {error}; use SI or {', '.join(allowed) or 'V, um, deg/s, G, ...'}") from None
+        here = f"; here SI or {', '.join(allowed)}" if allowed else ""
+        raise RecordingError(f"{at}: {error}{here}") from None
     if not allowed:
         return value, value
     for to in allowed:
