@@ -350,6 +350,8 @@ class Model:
         if paths and (inside is not None or forces) and len(run.starts) > 1:
             run = replace(run, about={o: outputs[o].value for o in paths}, memo=_without_runs(run))
             return self.twin.respond(run, inputs, how.theta, forces, how.join), run
+        if not (inside.integrates if inside is not None else self.twin.restart):
+            return outputs, run
         recorded, behind = run, self._behind(run, inputs, outputs, how)[1]
         for _ in range(START_PASSES if behind else 0):
             run = before_effects(recorded, behind)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import dlsim, dlti
@@ -9,13 +11,15 @@ from scipy.signal import dlsim, dlti
 from sim_devices.physics.exponential import exponential
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
 from tools.errors import RecordingError
-from tools.mismatch.engine.hold import infer_holds, undeclared, with_hold
+from tools.mismatch.engine.hold import hold_groups, infer_holds, undeclared, with_hold
 from tools.mismatch.engine.one_way import direction, one_way
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.report import BaseShift
 from tools.mismatch.recording import Recording
 from tools.mismatch.report import wording
+from tools.mismatch.twins.holds import common_hold
 from tools.mismatch.twins.linear import between_samples
+from tools.mismatch.twins.opaque import opaque_twin
 
 N = 3000
 
@@ -124,6 +128,20 @@ def test_each_input_has_a_hold_of_its_own(kind: str) -> None:
     assert np.std(base.residual["warm"]) > 2e-4
     problem, _, base = prepared(with_hold(rec, {"air": "linear"}), 0.3, 0, False)
     assert {s: h.how for s, h in infer_holds(problem, base).items()} == {"heat": "inferred", "air": "declared"}
+
+
+def test_a_program_that_is_told_one_hold_has_one_for_all_inputs() -> None:
+    """Equations may hold one input and not the other; an FMU for co-simulation may not."""
+    u = wave(np.random.default_rng(3), 500)
+    believed = {"A": [[-9.5]], "B": [[38.0, 9.5]], "C": [[1.0]]}
+    rec = recording("state_space", {"heat": u, "air": u[::-1].copy()}, {"warm": u}, believed)
+    problem, _, _ = prepared(rec, 0.3, 0, False)
+    assert hold_groups(problem, ("heat", "air")) == [("heat",), ("air",)]
+    told = replace(problem, twin=opaque_twin(rec, lambda inputs, parameters: dict(inputs), "made here"))
+    assert hold_groups(told, ("heat", "air")) == [("heat", "air")]
+    with pytest.raises(RecordingError, match="hold differs between inputs"):
+        common_hold(with_hold(rec, {"heat": "zero"}))
+    assert common_hold(with_hold(rec, {"heat": "zero", "air": "zero"})) == "zero"
 
 
 def test_a_hold_of_no_input_is_refused() -> None:

@@ -39,6 +39,11 @@ def undeclared(problem: Problem) -> tuple[str, ...]:
     return tuple(s for s, h in holds.items() if h == "linear" and s not in stated)
 
 
+def hold_groups(problem: Problem, inputs: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the groups of ``inputs`` that have one hold: each its own, or all that of a program that is told one."""
+    return [(s,) for s in inputs] if isinstance(problem.twin, DynamicTwin | OdeTwin) else [tuple(inputs)]
+
+
 def with_hold(recording: Recording, kinds: Mapping[str, str]) -> Recording:
     """Return the same recording with inputs of these holds."""
     holds = {**declared_holds(recording), **kinds}
@@ -95,8 +100,7 @@ def infer_holds(problem: Problem, base: Fit) -> dict[str, Hold]:
     free = undeclared(problem)
     if not free:
         return found
-    # a program that is told one hold has one for all
-    groups = [(s,) for s in free] if isinstance(problem.twin, DynamicTwin | OdeTwin) else [free]
+    groups = hold_groups(problem, free)
     shares = _shares(problem, base, groups, "zero")
     held = [g for g, x in zip(groups, shares, strict=True) if x.finite and x.size > max(0.5, CLEAR * x.spread)]
     straight, at = problem, base

@@ -45,7 +45,7 @@ class PlantCode:
     place: str
     speed: str
     hold: str
-    """As code."""
+    """Literal of the hold, in quotes."""
     start: str
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from tools.mismatch.engine.fit import fit, fit_base
-from tools.mismatch.engine.hold import DELAYS, as_held
+from tools.mismatch.engine.hold import DELAYS, as_held, hold_groups
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.infer.store import Scored, Store
 from tools.mismatch.simulate import Model
@@ -22,13 +22,15 @@ Assoc. 90, 1995, 773). Below it a new search would tell nothing new."""
 def better_holds(store: Store, chosen: Scored, holds: Mapping[str, Hold]) -> dict[str, Hold]:
     """Return held inputs with which a set of effects scores better than ``chosen``; empty if there are none.
 
-    Tried are the inputs whose hold was assumed, one by one and together. Holds have no price, so that a set without a
-    delay of half a sample, which held inputs explain, is better by the price of that name.
+    Tried are the inputs whose hold was assumed, one by one where each may have its own, and together. Holds have no
+    price, so that a set without a delay of half a sample, which held inputs explain, is better by the price of that
+    name.
     """
     assumed = [s for s, h in holds.items() if h.how == "assumed"]
     if not assumed or not chosen.placed:
         return {}
-    alternatives = [(s,) for s in assumed] + ([tuple(assumed)] if len(assumed) > 1 else [])
+    groups = hold_groups(store.problem, assumed)
+    alternatives = [*groups, tuple(assumed)] if len(groups) > 1 else groups
     found = [(*_best(store, held), held) for held in alternatives]
     score, names, held = max(found, key=lambda f: f[0])
     before, _ = _best(store, ())  # with the same effort

@@ -20,7 +20,7 @@ from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.holds import common_hold
+from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, common_hold, read_holds
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
 
 OWN_KEYS = ("path", "hold")
@@ -113,7 +113,7 @@ def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
     if not path.is_file():
         raise RecordingError(f"{where} path: {path} does not exist")
     start = {k: v for k, v in recording.twin.parameters.items() if k not in OWN_KEYS}
-    common_hold(recording)
+    read_holds(recording, STRAIGHT_OR_HELD)
     run = FmuRun(path, tuple(recording.outputs), recording.dt, recording.path, tuple(recording.inputs), start)
     known = run.names()
     lost = [s for s in (*recording.inputs, *recording.outputs, *start) if s not in known]
