@@ -133,7 +133,7 @@ def test_each_input_has_a_hold_of_its_own(kind: str) -> None:
 def test_a_program_that_is_told_one_hold_has_one_for_all_inputs() -> None:
     """Equations may hold one input and not the other; an FMU for co-simulation may not."""
     u = wave(np.random.default_rng(3), 500)
-    believed = {"A": [[-9.5]], "B": [[38.0, 9.5]], "C": [[1.0]]}
+    believed: dict[str, object] = {"A": [[-9.5]], "B": [[38.0, 9.5]], "C": [[1.0]]}
     rec = recording("state_space", {"heat": u, "air": u[::-1].copy()}, {"warm": u}, believed)
     problem, _, _ = prepared(rec, 0.3, 0, False)
     assert hold_groups(problem, ("heat", "air")) == [("heat",), ("air",)]
