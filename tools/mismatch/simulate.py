@@ -7,7 +7,7 @@ weights are in output units and linear: input or output placement is the same th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,8 +24,10 @@ from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
-START_PASSES = 2
-"""Number of passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
+START_PASSES = 8
+"""Most passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
+SETTLED = 1e-5
+"""Change of an output by a pass, as a share of its range, below which no other is made."""
 
 
 @dataclass(frozen=True)
@@ -341,23 +343,36 @@ class Model:
         the others are taken off the measured outputs, pass by pass.
         """
         inside = inside_of(self.twin)
-        paths = self._paths(run, how.theta)
-        beside = self._beside(run, how.theta) if run.window and not forces else {}
-        run = replace(run, bent=self.bends, paths=paths, beside=beside)
+        paths = self._paths(run, how.theta, forces)
+        run = replace(run, bent=self.bends, paths=paths)
+        reads = bool(run.window) and not forces and isinstance(self.twin, DynamicTwin | CascadeTwin)
+        if reads:
+            run = self._with_beside(run, how.theta, {})
         outputs = self.twin.respond(run, inputs, how.theta, forces, how.join)
         if not run.window:
             return outputs, run
-        if paths and (inside is not None or forces) and len(run.starts) > 1:
+        if reads and self.curved:
+
+            def carried(outputs: dict[str, Signal], before: Run) -> Started:
+                now = self._with_beside(before, how.theta, outputs)
+                return self.twin.respond(now, inputs, how.theta, forces, how.join), now
+
+            return settle((outputs, run), carried, how.theta, grows=False)
+        before = len(run.starts) > 1 or not all(p.is_linear for p in paths.values())
+        if paths and before and (inside is not None or forces):
             run = replace(run, about={o: outputs[o].value for o in paths}, memo=_without_runs(run))
             return self.twin.respond(run, inputs, how.theta, forces, how.join), run
         if not (inside.integrates if inside is not None else self.twin.restart):
             return outputs, run
         recorded, behind = run, self._behind(run, inputs, outputs, how)[1]
-        for _ in range(START_PASSES if behind else 0):
-            run = before_effects(recorded, behind)
-            outputs = self.twin.respond(run, inputs, how.theta, forces, how.join)
-            behind = self._behind(run, inputs, outputs, how)[1]
-        return outputs, run
+        if not behind:
+            return outputs, run
+
+        def read(outputs: dict[str, Signal], before: Run) -> Started:
+            now = before_effects(recorded, self._behind(before, inputs, outputs, how)[1])
+            return self.twin.respond(now, inputs, how.theta, forces, how.join), now
+
+        return settle((outputs, run), read, how.theta, grows=True)
 
     def _behind(
         self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], how: Pass
@@ -378,48 +393,77 @@ class Model:
                 drive = self.twin.drive(o)
                 by = inputs[drive] if self.twin.static and drive else None
                 was = found[o]
-                now = self._pass(run, k, was, by, o, how)
+                now = self._pass(run, k, was, by, o, how, run.beside.get(o, ()) if self.curved else ())
                 # with weights the outputs of a linear twin would be affine in them no more
                 afresh = inside.integrates if inside is not None else self.twin.restart and not pl.parts.weights
-                if afresh and (pl.effect.driven or inside is not None) and o not in run.paths:
+                linear = o in run.paths and run.paths[o].is_linear
+                if afresh and (pl.effect.driven or inside is not None) and not linear:
                     # the start states depend on it
                     if how.folded is not None:
                         how.folded.update(now.columns)
                     now = fold(now, how.theta)
-                    change[o] = change.get(o, 0.0) + now.value - fold(was, how.theta).value
+                    if o not in run.paths:
+                        change[o] = change.get(o, 0.0) + now.value - fold(was, how.theta).value
                 found[o] = now
         return {o: fold(s, how.theta) if how.join else s for o, s in found.items()}, change
 
-    def _beside(self, run: Run, theta: Array) -> dict[str, dict[int, Array]]:
-        """Return the columns of what is added behind the outputs of a linear twin that nothing bends.
+    @cached_property
+    def curved(self) -> bool:
+        """Return True if start states are read behind curves or loops, whose columns follow the run and so the weights.
 
-        A drift or a step is part of what was measured, and of no start state. Where an effect is driven by the output
-        with weights, its columns would depend on the start and therefore on all of these weights.
+        The weights are still linear parameters: they are solved again at the run that they give.
+        """
+        return any(self._curves(o) for o in self.twin.outputs)
+
+    def _curves(self, output: str) -> bool:
+        """Return True if an output passes through driven effects, and all of these have weights."""
+        if not isinstance(self.twin, DynamicTwin | CascadeTwin):
+            return False
+        driven = [p.effect for p in self.placed if p.site == "output" and output in p.outputs and p.effect.driven]
+        return bool(driven) and all(e.kind == "add" for e in driven)
+
+    def _with_beside(self, run: Run, theta: Array, outputs: Mapping[str, Signal]) -> Run:
+        """Return the run of a linear twin with the columns of what is added behind each output.
+
+        A drift or a step is part of what was measured, and of no start state; nor is what a curve or a loop adds, whose
+        columns are those at an earlier run (``outputs``; none yet: they are left out).
         """
         found: dict[str, dict[int, Array]] = {}
-        if not isinstance(self.twin, DynamicTwin | CascadeTwin):
-            return found
+        tokens: list[object] = []
         how = Pass(theta, False)
         for o in self.twin.outputs:
             behind = [k for k in self.order if self.placed[k].site == "output" and o in self.placed[k].outputs]
-            if any(self.placed[k].effect.driven and self.placed[k].effect.kind != "linear" for k in behind):
-                continue
             still = Signal(np.zeros(run.t.size))
+            if self._curves(o):
+                if o not in outputs:
+                    continue
+                still = fold(outputs[o], theta)
+            elif any(self.placed[k].effect.driven and self.placed[k].effect.kind != "linear" for k in behind):
+                continue
+            kept = {j for k in behind for j in range(self._slices[k][1].start, self._slices[k][1].stop)}
             for k in behind:
-                still = self._pass(run, k, still, None, o, how)
+                still = self._pass(run, k, still, None, o, how, kept)
             if still.columns:
                 found[o] = dict(still.columns)
-        return found
+                tokens.append((o, still.token))
+        return replace(run, beside=found, beside_token=tuple(tokens))
 
-    def _paths(self, run: Run, theta: Array) -> dict[str, Path]:
-        """Return the paths of the outputs behind which only linear effects are driven."""
+    def _paths(self, run: Run, theta: Array, forces: Sequence[Force]) -> dict[str, Path]:
+        """Return the paths of the outputs from which start states are read through the effects behind.
+
+        A linear run needs linear ones; where states are found by runs, curves and loops may be driven, too, but not
+        effects behind which an output stands still: it does not show the state then.
+        """
         found: dict[str, Path] = {}
-        if not isinstance(self.twin, DynamicTwin | CascadeTwin) and inside_of(self.twin) is None:
+        inside = inside_of(self.twin)
+        if not isinstance(self.twin, DynamicTwin | CascadeTwin) and inside is None:
             return found
+        by_runs = bool(forces) or (inside is not None and inside.integrates)
+        kinds = ("linear", "add") if by_runs else ("linear",)
         for o in self.twin.outputs:
             behind = [k for k in self.order if self.placed[k].site == "output" and o in self.placed[k].outputs]
             behind = [k for k in behind if self.placed[k].effect.driven]
-            if behind and all(self.placed[k].effect.kind == "linear" for k in behind):
+            if behind and all(self.placed[k].effect.kind in kinds for k in behind):
                 found[o] = self._path(run, behind, o, theta)
         return found
 
@@ -428,11 +472,15 @@ class Model:
 
         def carry(x: Array) -> Array:
             for k in behind:
-                x = self._pass(run, k, Signal(x), None, output, how).value
+                # no token tells these signals apart
+                x = self._pass(replace(run, memo={}), k, Signal(x), None, output, how).value
             return x
 
-        places = ((self.placed[k], theta[self._slices[k][0]]) for k in behind)
-        return Path(carry, tuple((p.effect.form, q.tobytes(), _frozen(p.settings)) for p, q in places))
+        token: list[object] = []
+        for pl, (q, w) in ((self.placed[k], self._slices[k]) for k in behind):
+            token += [pl.effect.form, theta[q].tobytes(), theta[w].tobytes(), _frozen(pl.settings)]
+        is_linear = all(self.placed[k].effect.kind == "linear" for k in behind)
+        return Path(carry, tuple(token), is_linear)
 
     def _driven(
         self, run: Run, how: Pass, given: Mapping[str, Signal] | None = None
@@ -464,7 +512,10 @@ class Model:
         a, b = self._slices[k]
         return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)
 
-    def _pass(self, run: Run, k: int, x: Signal, by: Signal | None, output: str, how: Pass) -> Signal:
+    def _pass(
+        self, run: Run, k: int, x: Signal, by: Signal | None, output: str, how: Pass, kept: Collection[int] = ()
+    ) -> Signal:
+        """Return ``x`` behind placed effect ``k``; the columns ``kept`` go round a driven effect with weights."""
         theta = how.theta
         pl, effect = self.placed[k], self.placed[k].effect
         a, b = self._slices[k]
@@ -492,9 +543,12 @@ class Model:
         basis = effect.basis
         assert basis is not None
         if effect.driven:
-            s = collapse(by if by is not None else x)
-            if s is not x and by is None:
-                x = s
+            around = {j: c for j, c in x.columns.items() if j in kept} if by is None else {}
+            s = by if by is not None else replace(x, columns={j: c for j, c in x.columns.items() if j not in around})
+            s = collapse(s)
+            if by is None:
+                x = replace(s, columns=around)
+                s = fold(x, theta)
         else:
             s = Signal(x.value, {}, ("undriven",))
         columns = remember(run.memo, (key, s.token), lambda: np.asfortranarray(basis(s.value, ctx, q, pl.settings)))
@@ -516,6 +570,28 @@ class Model:
             flow = self._courses(run, Pass(theta, False, folded))[0]
         found = {j for s in flow.values() for j in s.columns}
         return found - folded
+
+
+Started = tuple[dict[str, Signal], Run]
+
+
+def settle(first: Started, again: Callable[[dict[str, Signal], Run], Started], theta: Array, *, grows: bool) -> Started:
+    """Return the outputs and the run of the last pass of ``again`` at ``theta``.
+
+    Unless the change by a pass may grow (``grows``), that pass is not used: the start state is hardly seen behind its
+    effects, and passes lead away from it.
+    """
+    last, was = first, np.inf
+    for _ in range(START_PASSES):
+        outputs, run = again(*last)
+        pairs = [(fold(last[0][o], theta).value, fold(s, theta).value) for o, s in outputs.items()]
+        change = max(float(np.max(np.abs(b - a)) / max(np.ptp(b), 1e-300)) for a, b in pairs)
+        if not (change < was or grows):
+            break
+        last, was = (outputs, run), change
+        if change <= SETTLED:
+            break
+    return last
 
 
 def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording
 from tools.mismatch.engine.pose import pose
+from tools.mismatch.engine.projected import Projected
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.screen import places
 from tools.mismatch.placed import Placed
@@ -156,3 +157,44 @@ def test_a_drift_of_a_sensor_is_no_start_state(kind: str) -> None:
     left = none - per_unit * (per_unit @ none) / (per_unit @ per_unit)
     assert np.sqrt(np.mean(none**2)) > 5 * noise
     assert np.sqrt(np.mean(left**2)) < 1.1 * noise
+
+
+@pytest.mark.parametrize("kind", ["mechanical_axis", "state_space", "ode"])
+def test_a_curved_sensor_does_not_bend_the_start_of_a_run(kind: str) -> None:
+    """A slow mass is read by a sensor with a curve. Its weights are solved, though the start states depend on them."""
+    rng, n, dt, noise = np.random.default_rng(12), 4000, 0.002, 1e-4
+    u = np.repeat(rng.uniform(-4.0, 4.0, n // 20), 20)
+    damping, spring = 1.0, 0.0 if kind == "mechanical_axis" else 2.0
+    a = np.array([[0.0, 1.0], [-2 * spring, -2 * damping]])
+    whole = expm(np.block([[a, np.array([[0.0], [2.0]])], [np.zeros((1, 3))]]) * dt)
+    x, course = np.array([0.3, 0.2]), np.empty(n)
+    for k in range(n):
+        course[k] = x[0]
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[k]
+    middle, half = 0.5 * (course.max() + course.min()), 0.5 * float(np.ptp(course))
+    z = (course - middle) / half
+    truth = half * np.array([0.10, -0.06, 0.08])
+    curve = truth @ np.array([1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z, z])
+    y = course + curve + rng.normal(0.0, noise, n)
+    if kind == "ode":
+        own: dict[str, object] = {"c": 2 * damping, "k": 2 * spring, "hold": "zero", "fixed": ["c", "k"]}
+        own |= {"states": {"x": {"unit": "m"}, "v": {"unit": "m/s"}}, "outputs": {"position": "x"}}
+        own |= {"equations": {"x": "v", "v": "2 * force - c * v - k * x"}}
+    elif kind == "mechanical_axis":
+        own = {"mass": 0.5, "damping": damping, "hold": "zero"}
+    else:
+        own = {"A": a.tolist(), "B": [[0.0], [2.0]], "C": [[1.0, 0.0]], "hold": "zero"}
+    rec = recording(kind, {"force": u}, {"position": y}, own)
+    settings = {"range": (middle - half, middle + half), "shape": (3.0,), "slope": (1.0,)}
+    bent = Placed(EFFECTS["static_nonlinearity"], "output", "position", "sensor", ("position",), settings)
+    model = Model(make(rec), [bent])
+    theta = np.concatenate([make(rec).start(rec), truth])
+    ranges = ((0, 1300), (1320, 2600), (2620, n))
+    r = model.residual(View(rec, ranges, 40, fit=ranges), theta)["position"]
+    assert np.std(curve) > 100 * noise
+    assert np.sqrt(np.mean(r**2)) < 1.1 * noise
+    posed = pose(rec, 0.3, 0, None, lambda *_: (set(), []))
+    model = Model(posed.problem.twin, [bent])
+    _, solved = Projected(posed.problem, model, ("position",), 4000).evaluate(model.start(posed.recording))
+    if kind != "ode":  # which searches them
+        np.testing.assert_allclose(solved[-3:], truth, rtol=0.02)

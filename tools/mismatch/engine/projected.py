@@ -28,6 +28,11 @@ Symp., 1956)."""
 EVIDENCE = 8
 """Number of fixed-point steps to the prior variance of the weights."""
 
+AGAIN = 8
+"""Most times that weights whose columns follow the run are solved again at the run that they give."""
+ALIKE = 1e-3
+"""Change of the residual, as a share of it, below which they are not."""
+
 
 def huber_weights(z: Array) -> Array:
     """Return Huber's weights of residuals in units of their robust scale."""
@@ -84,6 +89,12 @@ def evidence(
             freedom[at] = np.clip(seen[at], 0.0, 1.0)
             precision[at] = noise * float(np.sum(freedom[at])) / max(float(w[at] @ w[at]), 1e-300)
     return precision * size**2, freedom
+
+
+def _alike(one: Sequence[Array], other: Sequence[Array]) -> bool:
+    """Return True if two residuals (rows,) per output differ by less than ``ALIKE`` of their size."""
+    apart = sum(float((a - b) @ (a - b)) for a, b in zip(one, other, strict=True))
+    return apart <= ALIKE**2 * sum(float(b @ b) for b in other)
 
 
 class Projected:
@@ -225,11 +236,24 @@ class Projected:
             design = self.model.design(self.view, theta, self.outputs, self.samples)
             parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
             return np.concatenate([*parts, self._from_priors(theta)]), theta
-        runaway = len(self.outputs) * self.rows.size + self.believed.size + self.small.size
-        runaway = np.full(runaway, np.inf), theta
+        solved = self._solved(theta)
+        for _ in range(AGAIN if self.model.curved else 0):
+            if solved is None:
+                break
+            theta, before = solved
+            solved = self._solved(theta)
+            if solved is not None and _alike(before, solved[1]):
+                break
+        if solved is None:
+            return np.full(len(self.outputs) * self.rows.size + self.believed.size + self.small.size, np.inf), theta
+        theta, left = solved
+        return np.concatenate([*left, self._from_priors(theta)]), theta
+
+    def _solved(self, theta: Array) -> tuple[Array, list[Array]] | None:
+        """Return theta with its linear part solved, and what is left (rows,) per output; None if it diverges."""
         normal = self._normal(theta)
         if normal is None:
-            return runaway
+            return None
         gram, cross, kept = normal
         # of effects only the weights of a group have a prior
         centre = self.centre[self.linear]
@@ -241,10 +265,11 @@ class Projected:
         scaled[np.diag_indices_from(gram)] += 1e-11 + self.ridge[self.linear] / size**2
         target = cross / size + 1e-11 * size * centre
         if not (np.all(np.isfinite(scaled)) and np.all(np.isfinite(target))):
-            return runaway
+            return None
         try:
             solution = bounded_solution(scaled, target, self.lo * size, self.hi * size) / size
         except np.linalg.LinAlgError:
             solution = np.clip(np.linalg.lstsq(scaled, target, rcond=1e-10)[0] / size, self.lo, self.hi)
+        theta = theta.copy()
         theta[self.linear] = solution
-        return np.concatenate([*(b - a @ solution[at] for a, b, at in kept), self._from_priors(theta)]), theta
+        return theta, [b - a @ solution[at] for a, b, at in kept]

@@ -57,10 +57,11 @@ class Force:
 
 @dataclass(frozen=True)
 class Path:
-    """Carries an output (n,) through the linear effects behind it, to what was measured; ``token`` identifies it."""
+    """Carries an output (n,) through the effects behind it, to what was measured; ``token`` identifies it."""
 
     carry: Callable[[Array], Array]
     token: tuple[object, ...]
+    is_linear: bool
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,9 @@ class Run:
     states. ``afresh``: samples at which the memory of effects restarts. ``bent``: True if a nonlinear effect stands
     between the states and the measured outputs, which are then no linear function of a start state. ``wanted``: sorted
     sample numbers of which alone a response may consist (None: it consists of all). ``paths``: of the outputs that were
-    measured behind linear effects; ``about``: an earlier run of these outputs (n,), else they are zero there.
-    ``beside``: what is added behind each output per unit of a weight; start states are read off the rest.
+    measured behind effects, linear ones for a linear run; ``about``: an earlier run of these outputs (n,), else
+    zeros. ``beside``: what is added behind each output per unit of a weight; start states are read off the rest;
+    ``beside_token`` identifies it.
     """
 
     t: Array
@@ -94,6 +96,7 @@ class Run:
     paths: Mapping[str, Path] = field(default_factory=dict[str, Path])
     about: Mapping[str, Array] = field(default_factory=dict[str, Array])
     beside: Mapping[str, Mapping[int, Array]] = field(default_factory=dict[str, Mapping[int, Array]])
+    beside_token: tuple[object, ...] = ()
 
     def behind_path(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""

@@ -188,7 +188,7 @@ class DynamicTwin(Head):
                         k, r = where[link.row]
                         column = x[k][:, r]
                     add(link.j if j < 0 else j, link.output, column)
-        token = ("plant", *map(tuple, tags.values()), run.window, run.bent)
+        token = ("plant", *map(tuple, tags.values()), run.window, run.bent, run.beside_token)
         token = (*token, *((o, p.token) for o, p in run.paths.items()))
         token = (*token, *(x.token for x in inputs.values()), tuple(folded))
         if join:
