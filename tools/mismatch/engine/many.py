@@ -83,7 +83,7 @@ def freed(model: Model, names: Sequence[str]) -> tuple[int, ...]:
 
 def everything(problem: Problem) -> Problem:
     """Return the same problem with all recordings fitted and none held out."""
-    spans = tuple(sorted((*problem.split.fit, *((a - problem.init, b) for a, b in problem.split.held_out))))
+    spans = tuple(sorted({*problem.split.fit, *((a - problem.init, b) for a, b in problem.split.held_out)}))
     return replace(problem, split=Split(problem.recording.n, spans, (), (), cut(spans, 48), own=False))
 
 

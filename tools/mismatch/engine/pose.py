@@ -207,7 +207,7 @@ class Ended:
 def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> Ended:
     """Repeat the fits for the export: the exported twin runs through, and cumulative effects are fitted in one run."""
     problem, twin = posed.problem, posed.problem.twin
-    if not twin.restart or problem.settle:
+    if not twin.restart or problem.settle or problem.recording.parts:
         return Ended(base, fitted)
     through = restarting(twin, False) if problem.split.own else twin
     whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
@@ -247,7 +247,22 @@ def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
 
 
 def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool) -> tuple[Problem, Fit, Fit]:
-    """Return the problem with its noise floors, the twin as given, and the recalibrated twin."""
+    """Return the problem with its noise floors, the twin as given, and the recalibrated twin.
+
+    Several recordings are split by what the recalibrated twin leaves of them.
+    """
+    found = _prepared(recording, held_out, seed, was_joined)
+    if not recording.parts:
+        return found
+    problem, _, base = found
+    left = np.zeros((recording.n, len(base.residual)))
+    left[problem.index] = np.abs(np.column_stack([*base.residual.values()]))
+    return _prepared(recording, held_out, seed, was_joined, left)
+
+
+def _prepared(
+    recording: Recording, held_out: float, seed: int, was_joined: bool, left: np.ndarray | None = None
+) -> tuple[Problem, Fit, Fit]:
     twin = make(recording)
     init = recording.split.initialization or 0
     parts = [(p.start, p.stop) for p in recording.parts]
@@ -258,7 +273,7 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
         drifts = twin.restart
     dynamic = hasattr(twin, "fastest_per_s")
     if parts:
-        twin, init, split = split_recordings(recording, twin, held_out, seed)
+        twin, init, split = split_recordings(recording, twin, held_out, seed, left)
     else:
         split = make_split(recording, held_out, seed, drifts)
     if not own and not parts and dynamic and not drifts and (was_joined or starts_anew(recording, twin, split, init)):
@@ -286,10 +301,14 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     return problem, raw, preferred(problem, fit_base(problem))
 
 
-def split_recordings(recording: Recording, twin: Twin, held_out: float, seed: int) -> tuple[Twin, int, Split]:
+def split_recordings(
+    recording: Recording, twin: Twin, held_out: float, seed: int, left: np.ndarray | None = None
+) -> tuple[Twin, int, Split]:
     """Return the twin that restarts in every recording of several, and the split that holds whole recordings out.
 
-    The number of samples that set its start is returned as well.
+    The number of samples that set its start is returned as well. ``left`` (n, outputs): the size of the residual of the
+    recalibrated twin, of which both parts shall have the same distribution, because an effect may be in a few
+    recordings only.
     """
     parts = [(p.start, p.stop) for p in recording.parts]
     init, skip = 0, UNKNOWN_START
@@ -298,7 +317,7 @@ def split_recordings(recording: Recording, twin: Twin, held_out: float, seed: in
         twin, skip = restarting(twin, True), 0.0
         shortest = min(b - a for a, b in parts)
         init = int(np.clip(4.0 / max(fastest_per_s * recording.dt, 1e-9), 20, max(shortest // 4, 20)))
-    signals = np.column_stack([*recording.signals.values()])
+    signals = np.column_stack([*recording.signals.values(), *(() if left is None else left.T)])
     return twin, init, split_of_parts(signals, parts, held_out=held_out, seed=seed, init=init, skip=skip)
 
 

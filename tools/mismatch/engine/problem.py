@@ -60,7 +60,7 @@ class Problem:
 
     @cached_property
     def view(self) -> View:
-        ranges = tuple(sorted((*self.split.fit, *_with_init(self.split.held_out, self.init, self.twin, self.split))))
+        ranges = tuple(sorted({*self.split.fit, *_with_init(self.split.held_out, self.init, self.twin, self.split)}))
         return View(self.recording, ranges, self.init, fit=self.split.fit if self.settle else (), afresh=self.afresh)
 
     @cached_property

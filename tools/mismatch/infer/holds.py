@@ -44,7 +44,7 @@ def _best(store: Store, held: Sequence[str]) -> tuple[float, frozenset[str]]:
     """Return the best score of the first sets with these inputs held, and the names of that set."""
     other = as_held(store.problem, dict.fromkeys(held, "zero"))
     with np.errstate(all="ignore"):
-        again = Store(other, fit_base(other), store.constants)
+        again = type(store)(other, fit_base(other), store.constants)
         for s in store.ranked()[:TRIED]:
             model = Model(other.twin, s.placed)
             theta = model.carry(s.fitted.model, s.fitted.theta, other.recording)

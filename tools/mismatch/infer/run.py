@@ -23,6 +23,7 @@ from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, wit
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated
 from tools.mismatch.infer.holds import better_holds
+from tools.mismatch.infer.pooled import pool
 from tools.mismatch.infer.sealed import score_sealed, seal
 from tools.mismatch.infer.search import Found, look, search
 from tools.mismatch.infer.store import Scored, Store
@@ -54,6 +55,9 @@ def infer(
     with threadpool_limits(1):
         posed = pose(kept, held_out, seed, effects, partial(look, constants, jobs, progress))
         found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
+        if kept.parts:
+            with np.errstate(all="ignore"):
+                found = replace(found, store=pool(found.store, jobs))
     return Inferred(posed, found, recording, unsealed)
 
 

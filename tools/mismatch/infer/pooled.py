@@ -1,0 +1,116 @@
+"""Scores sets of effects on every one of several recordings, each predicted by a fit that left it out.
+
+A search scores on the recordings that its split holds out. Its decision would rest on those few alone, and an effect
+that they hardly show would be lost. Here the folds of a cross-validation cover all recordings (Stone, J. Royal Stat.
+Soc. B 36, 1974, 111), so that the evidence is the sum over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.many import everything
+from tools.mismatch.engine.problem import Array, Problem
+from tools.mismatch.engine.residual import residuals
+from tools.mismatch.engine.split import Split, cut, leave_out
+from tools.mismatch.engine.workers import mapped
+from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.store import Scored, Store
+from tools.mismatch.simulate import Model
+
+FOLDS = 4
+"""Largest number of fits of a set that leave recordings out: the computing time grows with their length only."""
+CARRIED = 8
+"""Number of sets of a search, best first, that are scored on all recordings."""
+ITERATIONS = 10
+"""Most iterations of a fit that leaves recordings out; it starts from the fit to all."""
+
+
+def pooled(problem: Problem) -> Problem:
+    """Return the problem with every recording both fitted and held out: its residuals are cross-validated."""
+    spans = everything(problem).split.fit
+    held = tuple((a + problem.init, b) for a, b in spans)
+    return replace(
+        problem, split=Split(problem.recording.n, spans, held, cut(held, 30), cut(spans, 48), own=False), hints=()
+    )
+
+
+def folds_of(problem: Problem) -> tuple[Problem, ...]:
+    """Return the problems of the folds, which together hold out every recording of a pooled ``problem`` once.
+
+    Neighbours are in different folds, because recordings may change in the course of time.
+    """
+    spans = problem.split.fit
+    count = min(FOLDS, len(spans))
+    n = problem.recording.n
+    return tuple(
+        replace(problem, split=leave_out(n, spans, range(k, len(spans), count), init=problem.init))
+        for k in range(count)
+    )
+
+
+def left_out(fold: Problem, model: Model, theta: Array) -> tuple[dict[str, Array], bool]:
+    """Fit a fold from ``theta`` and return the residuals of its held-out rows, and False if the fit failed."""
+    again = fit(fold, model, [theta], iterations=ITERATIONS)
+    residual = again.residual if again.ok else residuals(fold, model, theta)
+    return {o: r[fold.held_rows] for o, r in residual.items()}, again.ok
+
+
+class PooledStore(Store):
+    """Holds sets of effects whose residuals are those of cross-validation over the recordings.
+
+    A fit that is put into the store is to all recordings, and keeps its parameters.
+    """
+
+    def __init__(
+        self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = (), jobs: int = 1
+    ) -> None:
+        self.jobs = jobs
+        self._folds: tuple[Problem, tuple[Problem, ...]] | None = None
+        super().__init__(problem, base, constants, events)
+
+    def scored(self, fitted: Fit) -> Scored:
+        """Score a fit by its cross-validated residual, without storing it."""
+        return super().scored(self.cross_validated(fitted))
+
+    def cross_validated(self, fitted: Fit) -> Fit:
+        """Return ``fitted`` with each recording's residual of the fit that left it out; it is not ok if one failed.
+
+        Parameters as given are returned unchanged, since they have seen no recording.
+        """
+        if not fitted.model.placed and np.array_equal(fitted.theta, self.problem.given):
+            return fitted
+        folds = self.folds()
+        work = [(f, fitted.model, fitted.theta) for f in folds]
+        found = mapped(self.problem, left_out, work, self.jobs)
+        residual = {o: r.copy() for o, r in fitted.residual.items()}
+        for fold, (left, _) in zip(folds, found, strict=True):
+            for o, r in left.items():
+                residual[o][fold.held_rows] = r
+        ok = fitted.ok and (not fitted.model.placed or all(fine for _, fine in found))
+        return replace(fitted, residual=residual, ok=ok)
+
+    def folds(self) -> tuple[Problem, ...]:
+        """Return the problems of the folds with the noise floors that the store has at the moment."""
+        if self._folds is None or self._folds[0] is not self.problem:
+            self._folds = self.problem, folds_of(self.problem)
+        return self._folds[1]
+
+
+def pool(store: Store, jobs: int = 1) -> PooledStore:
+    """Return the best sets of a search, fitted to all recordings and scored on each."""
+    problem = pooled(store.problem)
+
+    def again(s: Scored) -> Fit:
+        return fit(problem, s.fitted.model, [s.fitted.theta], iterations=15)
+
+    out = PooledStore(problem, again(store.base), store.constants, store.events, jobs)
+    out.seen = dict(store.seen)
+    for s in [s for s in store.ranked() if s.placed][:CARRIED]:
+        out.put(again(s))
+    return out
