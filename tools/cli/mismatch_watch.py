@@ -16,7 +16,7 @@ LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 60.0
 
 FalseAlarmsOption = Annotated[
     float,
-    typer.Option("--false-alarms-per-hour", metavar="R", help="Stated sampling rate of all channels together, in Hz."),
+    typer.Option("--false-alarms-per-hour", metavar="R", help="False alarms per hour, of all channels together."),
 ]
 
 
