@@ -13,6 +13,7 @@ that instant: band, double integration and the sensor's filter in one set of tap
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import cos, isfinite, pi, sin, sqrt
@@ -63,9 +64,14 @@ class Bank:
 
 
 @dataclass(frozen=True)
-class CoreDesign:
-    """The same as the fields of ``AdaptiveDesign`` of these names, of signals that pass ``weight``: the tremor band,
-    and with ``core_above`` what is above it."""
+class WeightedDesign:
+    """Holds the prior as it is seen through the filter of errors ``weight`` (b0 b1 b2 a1 a2).
+
+    Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m). Of each axis: ``rest`` (3, m, m)
+    does not scale with the tremor; ``noise_cross`` (3, 3, m) and ``noise_power`` (3,) are the sensor noise's share in
+    learning. ``lean_cross`` (2, 3, one) and ``lean_power`` (2,) are what gravity can add to them.
+    ``weighted_power`` (2,), m^2, and ``least_power`` are of the priors' tremor.
+    """
 
     weight: Array
     tremor: Array
@@ -80,37 +86,26 @@ class CoreDesign:
 
 
 @dataclass(frozen=True)
-class AdaptiveDesign:
-    """``taps`` (3, L) on block means: the outputs' targets ``L // 2`` blocks ago. ``weight``, ``gate``: b0 b1 b2 a1 a2.
+class AdaptiveDesign(WeightedDesign):
+    """Holds everything that follows from a configuration; as a ``WeightedDesign`` it is of the whole motion.
 
-    Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m). Of each axis: ``rest`` (3, m, m)
-    does not scale with the tremor, ``quiet`` (3, m, m) is the penalty on what the filter passes above the band;
-    ``noise_cross`` (3, 3, m) and ``noise_power`` (3,) are the sensor noise's share in learning; ``lean`` says by how
-    much of ``lean_cross`` (2, 3, one) and ``lean_power`` (2,) gravity adds to it. All are of weighted
-    signals except ``quiet``, ``start`` (3, 2, 3, m), the priors' filters, and ``onward`` (3, C, m), next samples from
-    present features. ``gate_power`` (3,): of the gate's output, where both levels count the same.
+    ``core`` is of the tremor band, and with ``core_above`` of what is above it. ``taps`` (3, L) on block means: the
+    outputs' targets ``L // 2`` blocks ago. ``gate``: b0 b1 b2 a1 a2; ``gate_power`` (3,) of its output, where both
+    levels count the same. Not weighted are, of each axis: ``quiet`` (3, m, m), the penalty on what the filter passes
+    above the band; ``start`` (3, 2, 3, m), the priors' filters; ``onward`` (3, C, m), next samples from present
+    features. ``lean`` says by how much gravity adds ``lean_cross`` and ``lean_power``.
     """
 
     bank: Bank
     block_ticks: int
     taps: Array
-    weight: Array
     gate: Array
     gate_power: Array
-    tremor: Array
-    rest: Array
     quiet: Array
-    cross: Array
-    noise_cross: Array
-    noise_power: Array
     lean: Lean
-    lean_cross: Array
-    lean_power: Array
-    weighted_power: Array  # (2,) of the priors' tremor, m^2
-    least_power: float
     start: Array
     onward: Array
-    core: CoreDesign
+    core: WeightedDesign
 
 
 @dataclass(frozen=True)
@@ -361,6 +356,24 @@ def _shelf(hz: float, gain: float, tick_hz: float) -> tuple[Array, Array]:
     return numerator / (low + slope), np.array([low + slope, 2.0 * across[1], low - slope]) / (low + slope)
 
 
+@dataclass(frozen=True)
+class _Prior:
+    """Holds what the whole design and that of the core share: spectra, features ``plain`` (m, n) of the bank, targets
+    (3, n) on block means and as they are ``wanted``, and which channels see the motion of the tip."""
+
+    config: TremorConfig
+    s: _Spectra
+    plain: Complex
+    target: Complex
+    wanted: list[Array]
+    moving: Array
+
+    @property
+    def axes(self) -> range:
+        """Return the axes that differ: one without a lever, whose design all three have."""
+        return range(1 if self.config.lever is None else AXES)
+
+
 @lru_cache(maxsize=8)
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     """Return everything that follows from ``config``: the axes' designs, stacked. A run asks for it several times, so
@@ -371,124 +384,118 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     block = max(1, round(a.block_s * config.tick_hz))
     s = spectra(config)
     w = 2.0 * pi * s.hz
-    z = _complex(np.exp(1j * w / config.tick_hz))
-    back = _complex(1.0 / z)
-    b, denominator = _peak(a.emphasis_hz, a.emphasis_q, config.tick_hz)
-    numerator = denominator + (a.emphasis - 1.0) * b
-    if a.above > 1.0:
-        numerator, denominator = _shelf(a.above_hz, a.above, config.tick_hz)
-    weight = _polynomial(numerator, back) / _polynomial(denominator, back)
-    gate_b, gate_a = _peak(a.gate_hz, a.gate_q, config.tick_hz)
-    through_gate = _polynomial(gate_b, back) / _polynomial(gate_a, back)
-    plain = bank.response(z)
-    phi = plain * weight
     whole, core = (*a.cancel_from_hz, *a.cancel_to_hz), a.core_hz
     outputs = ((0.0, whole), (config.loop_delay_s, whole), (config.loop_delay_s, core))
     taps = np.stack([target_taps(config, block, h, edges) for h, edges in outputs])
     half = len(taps[0]) // 2
     in_blocks = np.exp(-1j * w[None, :] * block / config.tick_hz * (np.arange(len(taps[0])) - half)[:, None])
     target = (taps @ in_blocks) * block_response(s.hz, block, config.tick_hz)
-
     wanted = [band(s.hz, edges) * np.exp(1j * w * h) for h, edges in outputs]
-    as_seen = np.abs(s.seen) ** 2 * s.tremor
-    power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
-    unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
-    tremor = [p * _covariance(plain, seen, moving) for p, seen in zip(power, as_seen, strict=True)]
-    plain_cross = [
-        p * np.stack([_cross(plain * s.seen, t * e, moving[0]) for e in wanted])
-        for p, t in zip(power, s.tremor, strict=True)
-    ]
-    plain_rest, phi_rest = (_covariance(features, s.rest - s.noise, moving) for features in (plain, phi))
-    next_motion = np.stack([_cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, row) for row in moving])
-
-    def of_axis(axis: int) -> dict[str, Any]:
-        """Return what the sensor's noise along ``axis`` has a part in."""
-        noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
-        quiet = _penalty_above_band(config, bank, axis)
-        rest = plain_rest + _covariance(plain, noise, noisy)
-        sums = [part + rest + quiet for part in tremor]
-        gate = np.sum((s.rest + (noise - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
-        return {
-            "gate_power": a.gate_ratio * gate,
-            "rest": phi_rest + _covariance(phi, noise, noisy),
-            "quiet": quiet,
-            "noise_cross": np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]),
-            "noise_power": np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
-            "start": np.stack([solve_scaled(m, r) for m, r in zip(sums, plain_cross, strict=True)]),
-            "onward": solve_scaled(sums[0], next_motion + np.stack([_cross(plain, noise * z, row) for row in noisy])),
-        }
-
-    first = of_axis(0)
-    axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
-    core_b, core_a = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
-    core_b = (core_b + a.core_above * _high_pass(core_a)) / sqrt(1.0 + (a.core_above * a.core_q) ** 2)  # 1 at the peak
-    core = _core_design(config, s, (core_b, core_a), plain=plain, target=target, wanted=wanted, moving=moving)
-    lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
+    plain = bank.response(_complex(np.exp(1j * w / config.tick_hz)))
+    prior = _Prior(config, s, plain, target, wanted, moving)
+    back = _complex(1.0 / _complex(np.exp(1j * w / config.tick_hz)))
+    whole_design = _weighted(prior, _filter_of_errors(config), back)
+    # the same delay, rounded as in the versions whose recordings replay bit for bit
+    in_core = _complex(np.exp(-2j * pi * s.hz / config.tick_hz))
+    core_design = _weighted(prior, _core_filter(config), in_core)
+    gate_b, gate_a = _peak(a.gate_hz, a.gate_q, config.tick_hz)
     found = AdaptiveDesign(
+        **vars(whole_design),
         bank=bank,
-        core=core,
+        core=core_design,
         lean=lean_of(config),
-        lean_cross=lean_cross,
-        lean_power=lean_power,
         block_ticks=block,
         taps=taps,
-        weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         gate=np.array([*gate_b, *gate_a[1:]]) / gate_a[0],
-        tremor=np.stack([_covariance(phi, seen, moving) / u for seen, u in zip(as_seen, unit, strict=True)]),
-        cross=np.stack(
-            [
-                np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
-                for t, u in zip(s.tremor, unit, strict=True)
-            ]
-        ),
-        weighted_power=power * unit,
-        least_power=a.least_rms_m**2 * float(unit[0]),
-        **{name: np.stack([each[name] for each in axes]) for name in first},
+        **_unweighted(prior, bank, _polynomial(gate_b, back) / _polynomial(gate_a, back)),
     )
-    for array in (*vars(found).values(), *vars(core).values(), *vars(found.lean).values()):
+    for array in (*vars(found).values(), *vars(core_design).values(), *vars(found.lean).values()):
         if isinstance(array, np.ndarray):
             array.flags.writeable = False
     return found
 
 
-def _core_design(
-    config: TremorConfig,
-    s: _Spectra,
-    peak: tuple[Array, Array],
-    *,
-    plain: Complex,
-    target: Complex,
-    wanted: list[Array],
-    moving: Array,
-) -> CoreDesign:
-    """Return the prior as it is seen through ``peak`` (numerator and denominator): the tremor band alone."""
+def _filter_of_errors(config: TremorConfig) -> tuple[Array, Array]:
+    """Return numerator and denominator of the filter through which errors count: a peak at the tremor, or a shelf."""
     a = config.adaptive
-    numerator, denominator = peak
-    back = _complex(np.exp(-2j * pi * s.hz / config.tick_hz))
+    if a.above > 1.0:
+        return _shelf(a.above_hz, a.above, config.tick_hz)
+    b, denominator = _peak(a.emphasis_hz, a.emphasis_q, config.tick_hz)
+    return denominator + (a.emphasis - 1.0) * b, denominator
+
+
+def _core_filter(config: TremorConfig) -> tuple[Array, Array]:
+    """Return numerator and denominator of the filter of the core: a peak, 1 there, and a share of what is above it."""
+    a = config.adaptive
+    b, denominator = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
+    b = (b + a.core_above * _high_pass(denominator)) / sqrt(1.0 + (a.core_above * a.core_q) ** 2)
+    return b, denominator
+
+
+def _unweighted(prior: _Prior, bank: Bank, through_gate: Complex) -> dict[str, Any]:
+    """Return the fields of ``AdaptiveDesign`` that no filter of errors weighs, stacked over the axes."""
+    config, s, plain, moving, a = prior.config, prior.s, prior.plain, prior.moving, prior.config.adaptive
+    z = _complex(np.exp(1j * (2.0 * pi * s.hz) / config.tick_hz))
+    as_seen = np.abs(s.seen) ** 2 * s.tremor
+    power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
+    tremor = [p * _covariance(plain, seen, moving) for p, seen in zip(power, as_seen, strict=True)]
+    crosses = [
+        p * np.stack([_cross(plain * s.seen, t * e, moving[0]) for e in prior.wanted])
+        for p, t in zip(power, s.tremor, strict=True)
+    ]
+    moved = _covariance(plain, s.rest - s.noise, moving)
+    next_motion = np.stack([_cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, row) for row in moving])
+    fields: dict[str, list[Array]] = {"gate_power": [], "quiet": [], "start": [], "onward": []}
+    for axis in prior.axes:
+        noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
+        quiet = _penalty_above_band(config, bank, axis)
+        rest = moved + _covariance(plain, noise, noisy)
+        sums = [part + rest + quiet for part in tremor]
+        gate = np.sum((s.rest + (noise - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
+        onward = next_motion + np.stack([_cross(plain, noise * z, row) for row in noisy])
+        fields["gate_power"].append(np.asarray(a.gate_ratio * gate))
+        fields["quiet"].append(quiet)
+        fields["start"].append(np.stack([solve_scaled(m, r) for m, r in zip(sums, crosses, strict=True)]))
+        fields["onward"].append(solve_scaled(sums[0], onward))
+    return {name: _over_axes(each) for name, each in fields.items()}
+
+
+def _over_axes(each: Sequence[Array]) -> Array:
+    """Return one value of each axis, stacked; a single one counts for all axes."""
+    return np.stack([*each] * (AXES // len(each)))
+
+
+def _weighted(prior: _Prior, errors: tuple[Array, Array], back: Complex) -> WeightedDesign:
+    """Return the prior as it is seen through the filter ``errors`` (numerator, denominator). ``back`` (n,): response of
+    a delay of one tick."""
+    config, s, target, a = prior.config, prior.s, prior.target, prior.config.adaptive
+    numerator, denominator = errors
     weight = _polynomial(numerator, back) / _polynomial(denominator, back)
-    phi = plain * weight
-    unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
-    moved = _covariance(phi, s.rest - s.noise, moving)
-    noises = [(sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)) for axis in range(AXES)]
+    phi = prior.plain * weight
+    unit = np.array([np.sum(t * np.abs(prior.wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
+    moved = _covariance(phi, s.rest - s.noise, prior.moving)
+    noises = [(sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)) for axis in prior.axes]
     lean_cross, lean_power = _lean_noise(config, s, phi, weight, target)
-    return CoreDesign(
+    return WeightedDesign(
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         tremor=np.stack(
-            [_covariance(phi, np.abs(s.seen) ** 2 * t, moving) / u for t, u in zip(s.tremor, unit, strict=True)]
+            [_covariance(phi, np.abs(s.seen) ** 2 * t, prior.moving) / u for t, u in zip(s.tremor, unit, strict=True)]
         ),
-        rest=np.stack([moved + _covariance(phi, noise, noisy) for noise, noisy in noises]),
+        rest=_over_axes([moved + _covariance(phi, noise, noisy) for noise, noisy in noises]),
         cross=np.stack(
             [
-                np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
+                np.stack([_cross(phi * s.seen, weight * t * e, prior.moving[0]) for e in prior.wanted]) / u
                 for t, u in zip(s.tremor, unit, strict=True)
             ]
         ),
-        noise_cross=np.stack(
+        noise_cross=_over_axes(
             [np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]) for noise, noisy in noises]
         ),
         lean_cross=lean_cross,
         lean_power=lean_power,
-        noise_power=np.array([np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for noise, _ in noises]),
+        noise_power=_over_axes(
+            [np.asarray(np.sum(n * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ) for n, _ in noises]
+        ),
         weighted_power=np.array([a.tremor_rms_m**2, a.burst_rms_m**2]) * unit,
         least_power=a.least_rms_m**2 * float(unit[0]),
     )

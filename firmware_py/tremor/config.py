@@ -21,17 +21,11 @@ _Row = tuple[float, float, float, float, float, float]
 
 Method = str
 """One of ``METHODS``, or a name that an installed package offers (``firmware_py.tremor.own``)."""
-METHODS: tuple[Method, ...] = (
-    "adaptive",
-    "kalman",
-    "wflc_flc",
-    "flc",
-    "wflc",
-    "bmflc",
-    "ebmflc",
-    "bmflc_kalman",
-    "ar_kalman",
+METHODS: tuple[Method, ...] = ("adaptive", "wflc_flc", "flc", "wflc")
+_FORMER = MappingProxyType(
+    {"kalman": "kalman", "bmflc": "bmflc", "ebmflc": "bmflc", "bmflc_kalman": "bmflc", "ar_kalman": "ar"}
 )
+"""Methods that were built in, and the tables that had their options; ``tools/research`` offers them now."""
 
 
 def all_methods() -> tuple[Method, ...]:
@@ -41,21 +35,6 @@ def all_methods() -> tuple[Method, ...]:
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class KalmanConfig(_Table):
-    """Tremor as a sum of narrow-band oscillators, sensor noise and drift, all seen through the RC filter.
-
-    The gain depends only on ratios, so ``tremor_rms_m`` is the size the filter is best at, not a limit.
-    """
-
-    frequencies_hz: tuple[Positive, ...] = (8.5, 9.2, 10.0, 10.8, 11.5)
-    bandwidth_hz: Positive = 0.8
-    tremor_rms_m: Positive = 14e-6
-    sensor_noise_m_s2_rtHz: Positive = 1.4e-3  # at the tip; below the true 2e-3: measured best in 8-12 Hz
-    drift_m_s2: Positive = 0.02  # rms of what is left of gravity and bias
-    drift_s: Positive = 3.0
-    reading_noise_m_s2: Positive = 0.8e-3  # quantisation, after the RC filter
 
 
 class WflcConfig(_Table):
@@ -77,36 +56,6 @@ class WflcConfig(_Table):
     prefilter_order: Annotated[int, Field(ge=1, le=3)] = 3  # of the prototype: a band-pass doubles it
     ripple_dB: Positive = 1.0
     attenuation_dB: Positive = 40.0
-
-
-class BmflcConfig(_Table):
-    """Band-limited multiple Fourier linear combiner in its three forms (Veluvolu, Ang 2011).
-
-    ``memory_s`` is the window of E-BMFLC, ``memory_gain`` its gain; its band follows the centroid of the weights by
-    ``band_gain`` per second.
-    ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise, ``bias_walk``
-    that of the bias weight.
-    """
-
-    low_hz: Positive = 7.0
-    high_hz: Positive = 13.0
-    step_hz: Positive = 0.5
-    gain: Positive = 0.002
-    memory_gain: Positive = 0.01
-    bias_gain: Positive = 0.003
-    memory_s: Positive = 0.3
-    band_gain: Positive = 0.5
-    walk: Positive = 0.05
-    bias_walk: Annotated[float, Field(ge=0.0)] = 0.05
-
-
-class ArConfig(_Table):
-    """Direct multi-step autoregressive predictor, its coefficients tracked by a Kalman filter (Tatinati, Ang 2013)."""
-
-    order: Annotated[int, Field(ge=2, le=12)] = 6
-    spacing_s: Positive = 0.01
-    walk: Positive = 1e-4
-    noise: Positive = 0.1  # of the signal's rms
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
@@ -292,40 +241,44 @@ class TremorConfig(_Table):
     smoothing_s: Positive = 0.5
     floor_m: Positive = 0.3e-6
     max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
-    kalman: KalmanConfig = KalmanConfig()
     wflc: WflcConfig = WflcConfig()
-    bmflc: BmflcConfig = BmflcConfig()
-    ar: ArConfig = ArConfig()
     adaptive: AdaptiveConfig = AdaptiveConfig()
-    own: dict[str, float] = Field(default_factory=dict[str, float])
+    own: dict[str, Any] = Field(default_factory=dict[str, Any])
     """Options of a method that an installed package offers."""
     detectors: DetectorConfig = DetectorConfig()
 
     def __hash__(self) -> int:  # of equal configurations it is equal; ``own`` has none
         return hash((self.tick_hz, self.loop_delay_s, self.filter_cutoff_rad_s, self.adaptive, self.lever))
 
+    @model_validator(mode="before")
+    @classmethod
+    def _from_former(cls, table: Any) -> Any:
+        """Read benches and recordings in which the options of a method of ``_FORMER`` have a table of their own."""
+        if not isinstance(table, dict):
+            return table
+        given = cast("dict[str, Any]", table)
+        own = given.get(_FORMER.get(str(given.get("method")), ""), {})
+        kept = {key: value for key, value in given.items() if key not in _FORMER.values()}
+        return {**kept, "own": own} if own else kept
+
     @field_validator("method")
     @classmethod
     def _known(cls, method: str) -> str:
-        if method not in METHODS and method not in offered(ESTIMATORS):
-            raise ValueError(f"'{method}' is no estimator; there are {', '.join(all_methods())}")
-        return method
+        if method in METHODS or method in offered(ESTIMATORS):
+            return method
+        if method in _FORMER:
+            raise ValueError(f"'{method}' is an estimator to compare with: only a source tree has it (tools/research)")
+        raise ValueError(f"'{method}' is no estimator; there are {', '.join(all_methods())}")
 
     @model_validator(mode="after")
     def _check(self) -> TremorConfig:
         if not self.wflc.low_hz < self.wflc.start_hz < self.wflc.high_hz < 0.5 * self.tick_hz:
             raise ValueError("wflc: low_hz < start_hz < high_hz < tick_hz / 2 is needed")
-        if not self.bmflc.low_hz < self.bmflc.high_hz < 0.5 * self.tick_hz:
-            raise ValueError("bmflc: low_hz < high_hz < tick_hz / 2 is needed")
         a = self.adaptive
         if not max(a.cancel_to_hz[1], a.core_hz[-1], a.above_hz) < 0.5 * self.tick_hz:
             raise ValueError("adaptive: cancel_to_hz, core_hz and above_hz must end below tick_hz / 2")
-        if self.ar.order * self.ar.spacing_s > 0.25:
-            raise ValueError("ar: order times spacing_s must be below 0.25 s")
         if self.isolated and self.sees != "displacement":
             raise ValueError("isolated: only samples of a displacement can hold tremor alone")
-        if self.method == "kalman" and self.sees != "acceleration":
-            raise ValueError("method 'kalman' models an accelerometer: sees must be 'acceleration'")
         return self
 
     @property

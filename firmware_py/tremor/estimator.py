@@ -17,8 +17,6 @@ import numpy as np
 from firmware_py.records import Array, Records, copy_record, new
 from firmware_py.tremor.adaptive import ADAPTIVE
 from firmware_py.tremor.adaptive_design import lever_signals
-from firmware_py.tremor.ar_kalman import AUTOREGRESSIVE
-from firmware_py.tremor.bmflc import COMB
 from firmware_py.tremor.combiner import (
     combiner_coast,
     combiner_displacement,
@@ -28,7 +26,6 @@ from firmware_py.tremor.combiner import (
 )
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, HISTORY, ROWS, TURNS, EstimatorParams, EstimatorState, Family, Samples
-from firmware_py.tremor.oscillator_kalman import KALMAN
 from firmware_py.tremor.own import FOREIGN
 from hal.compiled import inlined_kernel, kernel
 from hal.kernel_calls import ChosenKernel
@@ -59,26 +56,9 @@ def _three(config: TremorConfig) -> Any:
 
 
 COMBINERS = Family(EstimatorParams, EstimatorState, combiner_params, _three, _no_tick, _no_sample, _combined)
-FAMILIES: Mapping[str, Family] = {
-    "adaptive": ADAPTIVE,
-    "kalman": KALMAN,
-    "comb": COMB,
-    "ar": AUTOREGRESSIVE,
-    "own": FOREIGN,
-    "combiner": COMBINERS,
-}
+FAMILIES: Mapping[str, Family] = {"adaptive": ADAPTIVE, "own": FOREIGN, "combiner": COMBINERS}
 """Families by the name of their records. The combiner's records are always there and so come last."""
-FAMILY_OF: Mapping[str, str] = {
-    "adaptive": "adaptive",
-    "kalman": "kalman",
-    "wflc_flc": "combiner",
-    "flc": "combiner",
-    "wflc": "combiner",
-    "bmflc": "comb",
-    "ebmflc": "comb",
-    "bmflc_kalman": "comb",
-    "ar_kalman": "ar",
-}
+FAMILY_OF: Mapping[str, str] = {"adaptive": "adaptive", "wflc_flc": "combiner", "flc": "combiner", "wflc": "combiner"}
 """Family of each built-in method; a method of another package is of the family "own"."""
 _tick = ChosenKernel(FAMILIES, "tick")
 _sample = ChosenKernel(FAMILIES, "sample")

@@ -21,14 +21,14 @@ from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
 from firmware_py.records import Array, Records, field, new, record
-from firmware_py.tremor.config import METHODS, TremorConfig
+from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.plugins import ESTIMATORS, load
 
-STATE = 256  # numbers of memory for each axis
-NUMBERS = 64  # of the design
+STATE = 256
+NUMBERS = 64
 
 
 @record
@@ -36,14 +36,14 @@ class OwnParams:
     """The arguments of an estimator of another package."""
 
     address: int = field("1")  # of its step
-    numbers: Array = field("as its design says", NUMBERS)
+    numbers: Array = field("as its design says", "numbers")
 
 
 @record
 class OwnState:
     """The memory and the results of an estimator of another package."""
 
-    memory: Array = field("as its step says", AXES, STATE)
+    memory: Array = field("as its step says", AXES, "memory")
     out: Array = field("m", AXES, 2)
 
 
@@ -65,36 +65,46 @@ class ForeignNumbers(EstimatorParams):
 class OwnEstimator:
     """Describes an estimator of another package, which the entry point names.
 
-    ``design(config)``: up to ``NUMBERS`` numbers from the configuration, its own options are ``config.own``.
-    ``step(memory, numbers, sample, have, out)``: one tick of one axis, written for numba. ``memory`` (STATE,) is
+    ``design(config)``: up to ``most_numbers`` numbers from the configuration, its own options are ``config.own``.
+    ``step(memory, numbers, sample, have, out)``: one tick of one axis, written for numba. ``memory`` (most_memory,) is
     zero at the start and kept; ``sample`` m/s^2 or m as ``config.sees``, behind the RC filter, counts only if ``have``;
     ``out`` (2,): tremor in m at the sample and ``config.loop_delay_s`` later. It must not raise.
+    Other sizes than the usual ones compile the whole step of the instrument anew.
     """
 
-    design: Callable[[TremorConfig], Sequence[float]]
+    design: Callable[[TremorConfig], Sequence[float] | Array]
     step: Callable[..., None]
+    most_memory: int = STATE
+    most_numbers: int = NUMBERS
+
+
+def _estimator(config: TremorConfig) -> OwnEstimator:
+    estimator = load(ESTIMATORS, config.method, OwnEstimator)
+    if estimator is None:
+        raise BenchError(f"'{config.method}' is no estimator")
+    return estimator
 
 
 def own_params(config: TremorConfig) -> Records[OwnParams]:
-    """``address`` 0 for the methods that are built in. ``BenchError`` for a package that does not keep to the rules."""
-    estimator = None if config.method in METHODS else load(ESTIMATORS, config.method, OwnEstimator)
-    if estimator is None:
-        return new(OwnParams)
+    """Return the record of the method's code. ``BenchError`` for a package that does not keep to the rules."""
+    estimator = _estimator(config)
+    most = estimator.most_numbers
     given = np.asarray(estimator.design(config), dtype=np.float64)
-    if given.ndim != 1 or len(given) > NUMBERS or not np.isfinite(given).all():
-        raise BenchError(f"estimator '{config.method}': its design must be up to {NUMBERS} finite numbers")
-    numbers = np.zeros(NUMBERS)
+    if given.ndim != 1 or len(given) > most or not np.isfinite(given).all():
+        raise BenchError(f"estimator '{config.method}': its design must be up to {most} finite numbers")
+    numbers = np.zeros(most)
     numbers[: len(given)] = given
-    return new(OwnParams, address=_compiled(estimator.step).address, numbers=numbers)
+    return new(OwnParams, {"numbers": most}, address=_compiled(estimator).address, numbers=numbers)
 
 
 @cache  # keeps the machine code alive as long as the process may use its address
-def _compiled(step: Callable[..., None]) -> Any:
+def _compiled(estimator: OwnEstimator) -> Any:
+    step, most_memory, most_numbers = estimator.step, estimator.most_memory, estimator.most_numbers
     inner: Any = step if hasattr(step, "py_func") else numba.njit(error_model="numpy")(step)
     floats = types.CPointer(types.float64)
 
     def call(memory: Any, numbers: Any, sample: float, have: int, out: Any) -> None:
-        inner(carray(memory, STATE), carray(numbers, NUMBERS), sample, have != 0, carray(out, 2))
+        inner(carray(memory, most_memory), carray(numbers, most_numbers), sample, have != 0, carray(out, 2))
 
     signature: Any = types.void(floats, floats, types.float64, types.int64, floats)
     try:
@@ -148,7 +158,7 @@ def _output(axis: int, state: ForeignEstimator, params: ForeignNumbers) -> tuple
 
 
 def _state(config: TremorConfig) -> Records[OwnState]:
-    return new(OwnState)
+    return new(OwnState, {"memory": _estimator(config).most_memory})
 
 
 FOREIGN = Family(ForeignNumbers, ForeignEstimator, own_params, _state, _tick, _sample, _output)

@@ -14,6 +14,7 @@ from firmware_py.frame import LAYOUT, STATUS, TICK, TIP_ACCELERATION, TREMOR_AHE
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
 from firmware_py.tremor.stage import Tremor, estimate_kernel
 from tests.unit.tremor.synthetic import KINDS, RATE_HZ, Array, make_record, residual_percent
+from tools.research.tremor.baselines import BASELINES
 
 HELD_OUT = range(100, 106)
 
@@ -53,7 +54,7 @@ def residuals(method: Method, delay_ms: int, kind: str, seeds: Iterable[int], se
 
 def main() -> None:
     print(f"{'residual tremor, % rms in 8-12 Hz':36}" + "".join(f"{d:>8} ms" for d in (4, 8, 12)))
-    for method in METHODS:
+    for method in (*METHODS, *BASELINES):
         for kind in KINDS:
             row = [residuals(method, delay, kind, HELD_OUT) for delay in (4, 8, 12)]
             print(f"{method:12}{kind:24}" + "".join(f"{np.mean(r):5.1f} ±{np.std(r):4.1f}" for r in row))

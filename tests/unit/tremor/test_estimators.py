@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.tremor.ar_kalman import chain_gain_and_lag, horizons
-from firmware_py.tremor.bmflc import comb_size
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
 from firmware_py.tremor.estimator import ROWS, Estimator, run_estimator
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_response, prefilter_sections
@@ -15,7 +13,11 @@ from tests.unit.allocations import allocations
 from tests.unit.tremor.estimator_state import peek, unfiltered
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 from tests.unit.tremor.test_adaptive import tone_acceleration
+from tools.research.tremor.baselines import BASELINES
+from tools.research.tremor.baselines.ar_kalman import chain_gain_and_lag, horizons
+from tools.research.tremor.baselines.bmflc import BmflcConfig, comb_size
 
+EVERY = (*METHODS, *BASELINES)
 # how far a method may be off on a steady tone at 10 Hz, share of its amplitude: LMS keeps a ripple, a short memory
 # does not reach the whole, and the adaptive filter allows for sensor noise that is not there
 TONE_ERROR: dict[Method, float] = {
@@ -32,7 +34,7 @@ TONE_ERROR: dict[Method, float] = {
 
 
 @pytest.mark.parametrize("size", [5e-6, 500e-6])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EVERY)
 def test_a_tone_is_predicted_whatever_its_size(method: Method, size: float) -> None:
     n, delay = 12_000, 0.004
     config = TremorConfig(method=method, loop_delay_s=delay)
@@ -44,7 +46,7 @@ def test_a_tone_is_predicted_whatever_its_size(method: Method, size: float) -> N
     assert result.confidence[-1, 0] > 0.8
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EVERY)
 def test_a_step_allocates_nothing(method: Method) -> None:
     """A call from Python wraps its arrays: one tick and eight hundred, with a hole in them, ask for the same."""
     estimator = Estimator(TremorConfig(method=method))
@@ -60,7 +62,7 @@ def test_a_step_allocates_nothing(method: Method) -> None:
     assert asked[0] == asked[1]
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "kalman"])
+@pytest.mark.parametrize("method", [m for m in EVERY if m != "kalman"])
 def test_displacement_with_voluntary_motion(method: Method) -> None:
     """Seen by a displacement sensor; the intended path is what is left, nothing of it below 1 Hz is taken."""
     n = 12_000
@@ -76,7 +78,7 @@ def test_displacement_with_voluntary_motion(method: Method) -> None:
     assert abs(left) < 0.3 * 25e-6
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EVERY)
 def test_steps_are_the_batch_and_holes_are_coasted_over(method: Method) -> None:
     samples = np.stack([tone_acceleration(hz, 20e-6, 400) for hz in (9.0, 10.0, 11.0)], axis=1)
     samples[200:205] = np.nan
@@ -122,11 +124,11 @@ def test_horizon_is_filter_lag_and_loop_delay() -> None:
 
 
 def test_the_comb_covers_its_band() -> None:
-    assert comb_size(TremorConfig()) == 13
+    assert comb_size(BmflcConfig()) == 13
 
 
 def test_adaptive_band_follows_the_tremor() -> None:
     estimator = Estimator(TremorConfig(method="ebmflc"), axes=1)
     estimator.run(tone_acceleration(11.5, 20e-6, 12_000)[:, None])
-    shift_hz = peek(estimator.state).comb.shift[0] * RATE_HZ / (2 * np.pi)
+    shift_hz = estimator.state["own"]["memory"][0, 0, 1] * RATE_HZ / (2 * np.pi)
     assert 0.5 < shift_hz <= 1.5 + 1e-9

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from firmware_py.records import attributes
-from firmware_py.tremor.config import KalmanConfig, TremorConfig
-from firmware_py.tremor.oscillator_kalman import (
+from firmware_py.tremor.config import TremorConfig
+from tests.unit.tremor.compare import HELD_OUT, predictions, residuals
+from tests.unit.tremor.synthetic import CUTOFF_RAD_S, KINDS, RATE_HZ
+from tools.research.tremor.baselines.oscillator_kalman import (
+    KalmanConfig,
     _mode,
     combine,
     design_oscillators,
     kalman_correct,
-    kalman_params,
+    kalman_numbers,
     kalman_predict,
 )
-from tests.unit.tremor.compare import HELD_OUT, predictions, residuals
-from tests.unit.tremor.synthetic import CUTOFF_RAD_S, KINDS, RATE_HZ
 
 
 @numba.njit
@@ -42,7 +42,7 @@ def euler_model(white, k, substeps):  # type: ignore[no-untyped-def]
 
 @pytest.fixture(scope="module")
 def config() -> TremorConfig:
-    return TremorConfig(loop_delay_s=0.004, kalman=KalmanConfig(frequencies_hz=(9.0, 11.0), bandwidth_hz=1.0))
+    return TremorConfig(loop_delay_s=0.004, own={"frequencies_hz": (9.0, 11.0), "bandwidth_hz": 1.0})
 
 
 def test_the_filter_is_stable_and_its_rows_are_its_models(config: TremorConfig) -> None:
@@ -56,8 +56,8 @@ def test_the_filter_is_stable_and_its_rows_are_its_models(config: TremorConfig) 
 
 def test_the_error_is_what_the_design_promises() -> None:
     """On a signal that is exactly the model, made by small Euler steps: what the Riccati equation promised."""
-    k = KalmanConfig(frequencies_hz=(10.0,), bandwidth_hz=2.0)
-    config = TremorConfig(kalman=k)
+    own = {"frequencies_hz": (10.0,), "bandwidth_hz": 2.0}
+    k, config = KalmanConfig.model_validate(own), TremorConfig(own=own)
     substeps, n = 10, 30_000
     dt = 1e-3 / substeps
     rng = np.random.default_rng(4)
@@ -110,15 +110,15 @@ def test_voluntary_motion_passes() -> None:
 
 
 def test_kernels_are_the_matrix_filter(config: TremorConfig) -> None:
-    model, params = design_oscillators(config), kalman_params(config)
+    model, numbers = design_oscillators(config), kalman_numbers(config)
     rng = np.random.default_rng(2)
     state = rng.standard_normal(len(model.gain))
     twin, plain = state.copy(), state.copy()
     for y in rng.standard_normal(20):
-        kalman_predict(state, params[0])
-        kalman_correct(state, y, params[0])
-        kalman_predict.py_func(twin, attributes(params)[0])  # type: ignore[attr-defined]
-        kalman_correct.py_func(twin, y, attributes(params)[0])  # type: ignore[attr-defined]
+        kalman_predict(state, numbers)
+        kalman_correct(state, y, numbers)
+        kalman_predict.py_func(twin, numbers)  # type: ignore[attr-defined]
+        kalman_correct.py_func(twin, y, numbers)  # type: ignore[attr-defined]
         plain = model.transition @ plain
         plain = plain + model.gain * (y - model.observe @ plain)
     np.testing.assert_allclose(state, plain, rtol=1e-9, atol=1e-9)

@@ -14,6 +14,7 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console, pr
 from tools.cli.run import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.research.tremor.baselines import BASELINES
 from tools.terminal import task_name
 
 
@@ -119,7 +120,7 @@ def evaluate(
 
 
 def _methods(names: list[str] | None) -> list[Method]:
-    wanted = [estimator_name(name) for name in names or METHODS]
+    wanted = [estimator_name(name) for name in names or (*METHODS, *BASELINES)]
     return [m for m in all_methods() if m in wanted]
 
 

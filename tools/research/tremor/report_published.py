@@ -42,15 +42,15 @@ BAND_PASS = (45.9, 60.6, 78.3, 114.2, 130.5)
 _COMB = {"low_hz": 8.0, "high_hz": 12.0, "step_hz": 0.25, "bias_walk": 0.0}  # 17 frequencies, as there
 _BAND = {"low_hz": 6.0, "high_hz": 14.0, "prefilter": "butterworth", "prefilter_order": 1}
 TUNED_ALONE: dict[Method, Mapping[str, Any]] = {
-    "bmflc": {"bmflc": {**_COMB, "gain": 0.01}},
-    "ebmflc": {"bmflc": {"memory_gain": 0.02}},
-    "bmflc_kalman": {"bmflc": {**_COMB, "walk": 3.0}},
-    "ar_kalman": {"ar": {"spacing_s": 0.001, "walk": 1e-3, "noise": 1e-4}},
+    "bmflc": {"own": {**_COMB, "gain": 0.01}},
+    "ebmflc": {"own": {"memory_gain": 0.02}},
+    "bmflc_kalman": {"own": {**_COMB, "walk": 3.0}},
+    "ar_kalman": {"own": {"spacing_s": 0.001, "walk": 1e-3, "noise": 1e-4}},
 }
 TUNED_MIXED: dict[Method, Mapping[str, Any]] = {
     "wflc_flc": {"wflc": _BAND},
-    "bmflc_kalman": {"wflc": _BAND, "bmflc": {**_COMB, "walk": 0.005}},
-    "ar_kalman": {"wflc": _BAND, "ar": {"walk": 1e-5, "noise": 0.3}},
+    "bmflc_kalman": {"wflc": _BAND, "own": {**_COMB, "walk": 0.005}},
+    "ar_kalman": {"wflc": _BAND, "own": {"walk": 1e-5, "noise": 0.3}},
     "adaptive": {"adaptive": {"cancel_from_hz": (5.0, 7.0), "cancel_to_hz": (13.0, 16.0)}},
 }
 """As that page did, by a small grid, on at most three records: seeds 211 to 213; AR 211 and 212; with voluntary
@@ -58,8 +58,9 @@ motion AR, E-BMFLC and Kalman weights 211 alone."""
 
 
 def tuned(config: TremorConfig, changes: Mapping[str, Any]) -> TremorConfig:
-    """``config`` with ``changes``: tables of ``TremorConfig`` by name, key by key."""
-    return config.model_copy(update={k: getattr(config, k).model_copy(update=v) for k, v in changes.items()})
+    """``config`` with ``changes``: tables of ``TremorConfig`` by name, key by key, and ``own`` as a whole."""
+    tables = {k: v if k == "own" else getattr(config, k).model_copy(update=v) for k, v in changes.items()}
+    return config.model_copy(update=tables)
 
 
 def left(cases: Sequence[Case], config: TremorConfig, method: Method, horizons_ms: Sequence[int]) -> list[float]:

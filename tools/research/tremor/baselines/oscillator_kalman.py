@@ -19,16 +19,37 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 from scipy import linalg as scipy_linalg  # pyright: ignore[reportMissingTypeStubs]
 
-from firmware_py.records import Array, Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
-from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
+from firmware_py.tremor.own import OwnEstimator
 from hal.compiled import kernel
+from hal.errors import BenchError
+from hal.validation import Positive, validate_table
 
 Matrix = NDArray[np.float64]
 linalg: Any = scipy_linalg  # without type stubs
 ORDER = 4  # states of a mode: x, v, u, du/dt
+MEMORY, NUMBERS = 128, 1024
+FIRST = 3  # numbers in front of the rows: modes, drift, observe
+
+
+class KalmanConfig(BaseModel):
+    """Tremor as a sum of narrow-band oscillators, sensor noise and drift, all seen through the RC filter.
+
+    The gain depends only on ratios, so ``tremor_rms_m`` is the size the filter is best at, not a limit.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    frequencies_hz: tuple[Positive, ...] = (8.5, 9.2, 10.0, 10.8, 11.5)
+    bandwidth_hz: Positive = 0.8
+    tremor_rms_m: Positive = 14e-6
+    sensor_noise_m_s2_rtHz: Positive = 1.4e-3  # at the tip; below the true 2e-3: measured best in 8-12 Hz
+    drift_m_s2: Positive = 0.02  # rms of what is left of gravity and bias
+    drift_s: Positive = 3.0
+    reading_noise_m_s2: Positive = 0.8e-3  # quantisation, after the RC filter
 
 
 @dataclass(frozen=True)
@@ -75,7 +96,9 @@ def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
 
 def design_oscillators(config: TremorConfig) -> OscillatorModel:
     """Return the stationary filter for ``config``. Raises LinAlgError when the Riccati equation has no solution."""
-    k = config.kalman
+    k = validate_table(KalmanConfig, config.own, "[firmware.tremor.own]")
+    if config.sees != "acceleration":
+        raise BenchError("method 'kalman' models an accelerometer: sees must be 'acceleration'")
     m = len(k.frequencies_hz)
     n = ORDER * m + 2
     cutoff = config.filter_cutoff_rad_s
@@ -112,77 +135,44 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     return OscillatorModel(f, gain, c[0], now, ahead, float(np.sqrt(now @ posterior @ now)), m)
 
 
-@record
-class KalmanParams:
-    """The filter: its transition is block diagonal but for its last row, and kept so. States are balanced."""
+def kalman_numbers(config: TremorConfig) -> Matrix:
+    """Return modes, drift, observe; last row, gain, now and ahead (``n`` each); and the modes' blocks (4, 4) each.
 
-    blocks: Array = field("1", "modes", ORDER, ORDER)
-    drift: float = field("1")
-    last_row: Array = field("1", "states")
-    gain: Array = field("s^2/m", "states")
-    observe: float = field("m/s^2")
-    now: Array = field("m", "states")
-    ahead: Array = field("m", "states")
-
-
-@record
-class KalmanEstimator(EstimatorState):
-    """The estimator's state with the Kalman filter's."""
-
-    kalman: Array = field("1", AXES, "states")
-
-
-@record
-class KalmanNumbers(EstimatorParams):
-    """The estimator's parameters with the Kalman filter's."""
-
-    kalman: KalmanParams = field("")
-
-
-def kalman_params(config: TremorConfig) -> Records[KalmanParams]:
-    """Return the kernel's parameters."""
+    The transition is block diagonal but for its last row, and kept so. States are balanced.
+    """
     model = design_oscillators(config)
-    blocks = [model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)]
-    return new(
-        KalmanParams,
-        blocks=np.array(blocks),
-        drift=model.transition[-2, -2],
-        last_row=model.transition[-1],
-        gain=model.gain,
-        observe=model.observe[-1],
-        now=model.now,
-        ahead=model.ahead,
-    )
+    spans = [slice(ORDER * i, ORDER * (i + 1)) for i in range(model.n_modes)]
+    blocks = [model.transition[span, span].ravel() for span in spans]
+    rows = (model.transition[-1], model.gain, model.now, model.ahead)
+    return np.concatenate([[model.n_modes, model.transition[-2, -2], model.observe[-1]], *rows, *blocks])
 
 
 @kernel
-def kalman_predict(state: NDArray[np.float64], params: KalmanParams) -> None:
+def kalman_predict(state: Matrix, numbers: Matrix) -> None:
     """s <- F s for one axis, one tick; ``state`` (4 m + 2,)."""
     n = len(state)
-    last = 0.0
-    for i in range(n):
-        last += params.last_row[i] * state[i]
-    for m in range(len(params.blocks)):
-        block = params.blocks[m]
+    last = combine(state, numbers[FIRST : FIRST + n])
+    for m in range(int(numbers[0])):
+        block = numbers[FIRST + 4 * n + 16 * m :]
         j = 4 * m
         s0, s1, s2, s3 = state[j], state[j + 1], state[j + 2], state[j + 3]
         for r in range(4):
-            state[j + r] = block[r, 0] * s0 + block[r, 1] * s1 + block[r, 2] * s2 + block[r, 3] * s3
-    state[n - 2] *= params.drift
+            state[j + r] = block[4 * r] * s0 + block[4 * r + 1] * s1 + block[4 * r + 2] * s2 + block[4 * r + 3] * s3
+    state[n - 2] *= numbers[1]
     state[n - 1] = last
 
 
 @kernel
-def kalman_correct(state: NDArray[np.float64], measured: float, params: KalmanParams) -> None:
+def kalman_correct(state: Matrix, measured: float, numbers: Matrix) -> None:
     """s += K (y - C s): ``measured`` is the tip's acceleration m/s^2, behind the RC filter."""
     n = len(state)
-    innovation = measured - params.observe * state[n - 1]
+    innovation = measured - numbers[2] * state[n - 1]
     for i in range(n):
-        state[i] += params.gain[i] * innovation
+        state[i] += numbers[FIRST + n + i] * innovation
 
 
 @kernel
-def combine(state: NDArray[np.float64], row: NDArray[np.float64]) -> float:
+def combine(state: Matrix, row: Matrix) -> float:
     """row . state"""
     total = 0.0
     for i in range(len(state)):
@@ -190,26 +180,16 @@ def combine(state: NDArray[np.float64], row: NDArray[np.float64]) -> float:
     return total
 
 
-def _state(config: TremorConfig) -> Matrix:
-    return np.zeros((AXES, ORDER * len(config.kalman.frequencies_hz) + 2))
-
-
 @kernel
-def _tick(coasts: bool, state: KalmanEstimator, params: KalmanNumbers) -> None:
-    for i in range(AXES):
-        kalman_predict(state.kalman[i], params.kalman)
+def kalman_step(memory: Matrix, numbers: Matrix, sample: float, have: bool, out: Matrix) -> None:
+    """Compute one tick of one axis; see ``OwnEstimator``."""
+    n = ORDER * int(numbers[0]) + 2
+    state = memory[:n]
+    kalman_predict(state, numbers)
+    if have:
+        kalman_correct(state, sample, numbers)
+    out[0] = combine(state, numbers[FIRST + 2 * n : FIRST + 3 * n])
+    out[1] = combine(state, numbers[FIRST + 3 * n : FIRST + 4 * n])
 
 
-@kernel
-def _sample(samples: Samples, state: KalmanEstimator, params: KalmanNumbers) -> None:
-    for i in range(AXES):
-        kalman_correct(state.kalman[i], samples.tip[i], params.kalman)
-
-
-@kernel
-def _output(axis: int, state: KalmanEstimator, params: KalmanNumbers) -> tuple[float, float, float]:
-    ahead = combine(state.kalman[axis], params.kalman.ahead)
-    return combine(state.kalman[axis], params.kalman.now), ahead, ahead
-
-
-KALMAN = Family(KalmanNumbers, KalmanEstimator, kalman_params, _state, _tick, _sample, _output)
+KALMAN = OwnEstimator(kalman_numbers, kalman_step, MEMORY, NUMBERS)
