@@ -71,7 +71,6 @@ class PooledStore(Store):
         self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = (), jobs: int = 1
     ) -> None:
         self.jobs = jobs
-        self._folds: tuple[Problem, tuple[Problem, ...]] | None = None
         super().__init__(problem, base, constants, events)
 
     def scored(self, fitted: Fit) -> Scored:
@@ -85,7 +84,8 @@ class PooledStore(Store):
         """
         if not fitted.model.placed and np.array_equal(fitted.theta, self.problem.given):
             return fitted
-        folds = self.folds()
+        # made anew for each set, because the views of a problem keep columns
+        folds = folds_of(self.problem)
         work = [(f, fitted.model, fitted.theta) for f in folds]
         found = mapped(self.problem, left_out, work, self.jobs)
         residual = {o: r.copy() for o, r in fitted.residual.items()}
@@ -94,12 +94,6 @@ class PooledStore(Store):
                 residual[o][fold.held_rows] = r
         ok = fitted.ok and (not fitted.model.placed or all(fine for _, fine in found))
         return replace(fitted, residual=residual, ok=ok)
-
-    def folds(self) -> tuple[Problem, ...]:
-        """Return the problems of the folds with the noise floors that the store has at the moment."""
-        if self._folds is None or self._folds[0] is not self.problem:
-            self._folds = self.problem, folds_of(self.problem)
-        return self._folds[1]
 
 
 def pool(store: Store, jobs: int = 1) -> PooledStore:

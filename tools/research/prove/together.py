@@ -2,7 +2,7 @@
 
 ``python -m tools.research.prove.together --keep FOLDER --minutes 8`` goes on where it stopped. A family is one drawn
 case whose effect has ``SEVERITY`` noise rms after a re-fit, cut into 5 to 20 recordings: each begins amid the course of
-the plant, with a past that no recording holds. The first recording of each family is diagnosed alone beside it.
+the plant, with a past that no recording holds. With ``--alone`` the first recording of each is diagnosed alone, too.
 """
 
 from __future__ import annotations
@@ -70,14 +70,17 @@ def plan_of(seed: int, index: int, *, null: bool) -> draw.Plan:
     return draw.Plan("single", twin, (str(rng.choice([e for e in EFFECTS if e in TABLE[twin]])),), SEVERITY)
 
 
-def run_one(seed: int, index: int, max_samples: int, *, null: bool) -> dict[str, Any]:
-    """Draw, cut and diagnose one family; the outcome as a row. Linear algebra runs on one thread."""
+def run_one(seed: int, index: int, max_samples: int, *, null: bool, alone: bool = False) -> dict[str, Any]:
+    """Draw, cut and diagnose one family, and its first recording ``alone``; the outcome as a row.
+
+    Linear algebra runs on one thread.
+    """
     with threadpool_limits(1):
-        found = _run_one(seed, index, max_samples, null=null)
+        found = _run_one(seed, index, max_samples, null=null, alone=alone)
     return {"seed": seed, "revision": revision_and_day(), **found}
 
 
-def _run_one(seed: int, index: int, max_samples: int, *, null: bool) -> dict[str, Any]:
+def _run_one(seed: int, index: int, max_samples: int, *, null: bool, alone: bool) -> dict[str, Any]:
     plan = plan_of(seed, index, null=null)
     row: dict[str, Any] = {"index": index, "null": null, "twin": plan.twin, "effect": ", ".join(plan.effects)}
     try:
@@ -93,7 +96,7 @@ def _run_one(seed: int, index: int, max_samples: int, *, null: bool) -> dict[str
     report = diagnose(joined, jobs=1)
     row |= {"drawn": True, "recordings": count, "samples": recording.n, **_answers(report, plan.effects)}
     row["cpu_s"] = round(time.process_time() - began, 1)
-    if not null:
+    if alone and not null:
         row["alone"] = _answers(diagnose(first_alone(joined), jobs=1), plan.effects)
     return row
 
@@ -120,11 +123,13 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         ("effect named, recordings together", f"{100 * GOALS[0]:.0f} %", sum(r["named"] for r in some), len(some)),
         ("effect named, or in the group of a name", "-", sum(r["grouped"] for r in some), len(some)),
         ("a name besides the effect or its group", "-", sum(_has_false_name(r) for r in some), len(some)),
-        ("effect named, first recording alone", "-", sum(r["alone"]["named"] for r in some), len(some)),
         ("null families with a name", str(GOALS[1]), sum(bool(r["names"]) for r in none), len(none)),
         ("null families that are unexplained", "-", sum(r["verdict"] == "unexplained" for r in none), len(none)),
         ("families with a change between recordings named", "0", sum(bool(r["changes"]) for r in drawn), len(drawn)),
     ]
+    alone = [r["alone"]["named"] for r in some if "alone" in r]
+    if alone:
+        lines.insert(3, ("effect named, first recording alone", "-", sum(alone), len(alone)))
     text = ["| figure | goal | measured | 95 % interval |", "|---|---|---|---|"]
     for label, goal, k, n in lines:
         low, high = clopper_pearson(k, n) if n else (0.0, 1.0)
@@ -178,6 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=26)
     parser.add_argument("--samples", type=int, default=4000, help="most samples of a family")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no family after these")
+    parser.add_argument("--alone", action="store_true", help="diagnose the first recording of each family alone, too")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result there (.json or .md)")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -192,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             continue
         if time.monotonic() - began > 60 * options.minutes:
             break
-        rows.append(run_one(options.seed, index, options.samples, null=null))
+        rows.append(run_one(options.seed, index, options.samples, null=null, alone=options.alone))
         with file.open("a") as out:
             out.write(json.dumps(rows[-1]) + "\n")
     if not rows:
