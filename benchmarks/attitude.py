@@ -36,7 +36,7 @@ def rows() -> Iterator[Row]:
     short = tuple(x[:SLOW_N] for x in (rate, force, field))
 
     def ours(method: str, n: int) -> Callable[[], object]:
-        return lambda: Fusion(FusionConfig(method=method), RATE_HZ).run(rate[:n], force[:n], field[:n])  # type: ignore[arg-type]
+        return lambda: Fusion(FusionConfig(method=method), RATE_HZ).run(rate[:n], force[:n], field[:n])
 
     def python(name: str) -> Callable[[], object]:
         return lambda: getattr(ahrs.filters, name)(gyr=short[0], acc=short[1], mag=short[2], frequency=RATE_HZ)

@@ -63,7 +63,7 @@ def jobs() -> dict[str, Callable[[], object]]:
     signal = rng.standard_normal(POINTS)
     return {
         "step": step,
-        "attitude": lambda: Fusion(FusionConfig(), 286.0).run(*signals),
+        "attitude": lambda: Fusion(FusionConfig(method="mahony"), 286.0).run(*signals),
         "allan": lambda: allan_curve(signal, 1000.0),
     }
 

@@ -34,7 +34,7 @@ JOBS = {
     ),
     "attitude filter": (
         "from benchmarks.attitude import signals, Fusion, FusionConfig; x = signals({n}); "
-        "f = Fusion(FusionConfig(), 286.0); f.step(*(a[0] for a in x))",
+        "f = Fusion(FusionConfig(method='mahony'), 286.0); f.step(*(a[0] for a in x))",
         "f.run(*x)",
         60_000,
     ),

@@ -134,12 +134,13 @@ def load_bench(path: Path) -> BenchFile:
 
 
 def named_packages(description: BenchDescription) -> list[str]:
-    """Return ``module:object`` of the code that a bench names: its provider, and drivers and estimators of packages."""
+    """Return ``module:object`` of the code that a bench names: its provider, and drivers, estimators and filters."""
     targets = [str(description.emulation["provider"])] if "provider" in description.emulation else []
     drivers = {spec.driver for spec in description.device.values()}
-    tremor: Any = description.firmware.get("tremor")
-    methods = {str(cast(Any, tremor).get("method"))} if isinstance(tremor, dict) else set[str]()
-    for group, names in ((plugins.DRIVERS, drivers), (plugins.DEVICES, drivers), (plugins.ESTIMATORS, methods)):
+    tables: list[Any] = [description.firmware.get(key) for key in ("tremor", "fusion")]
+    methods = {str(cast("dict[str, Any]", table).get("method")) for table in tables if isinstance(table, dict)}
+    named = {plugins.DRIVERS: drivers, plugins.DEVICES: drivers, plugins.ESTIMATORS: methods, plugins.FUSION: methods}
+    for group, names in named.items():
         entries = (plugins.find_entry(group, name) for name in sorted(names & plugins.offered(group).keys()))
         targets += [entry.value for entry in entries if entry is not None]
     return targets

@@ -19,6 +19,7 @@ from hal.errors import BenchError
 DRIVERS = "micron.drivers"
 DEVICES = "micron.devices"
 ESTIMATORS = "micron.estimators"
+FUSION = "micron.fusion"
 EFFECTS = "micron.effects"
 TWINS = "micron.twins"
 

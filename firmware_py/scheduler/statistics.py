@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from firmware_py.scheduler.histogram import Distribution
+
+
+def _as_dict(snapshot: Any, key: str) -> dict[str, object]:
+    """Return all fields but ``key`` as JSON values; a distribution has its unit in its name."""
+    values = {f.name: getattr(snapshot, f.name) for f in fields(snapshot) if f.name != key}
+    return {
+        f"{name}_us" if isinstance(value, Distribution) else name: (
+            value.as_dict() if isinstance(value, Distribution) else value
+        )
+        for name, value in values.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,22 +47,7 @@ class TaskSnapshot:
 
     def as_dict(self) -> dict[str, object]:
         """Return the snapshot in the form of the ``micron run`` JSON."""
-        return {
-            "rate_hz": self.rate_hz,
-            "runs": self.runs,
-            "ignored_runs": self.ignored_runs,
-            "budget_us": self.budget_us,
-            "deadline_us": self.deadline_us,
-            "duration_us": self.duration.as_dict(),
-            "cpu_us": self.cpu.as_dict(),
-            "lateness_us": self.lateness.as_dict(),
-            "overruns": self.overruns,
-            "skipped": self.skipped,
-            "put_off": self.put_off,
-            "slips": self.slips,
-            "errors": self.errors,
-            "last_error": self.last_error,
-        }
+        return _as_dict(self, "name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +63,7 @@ class BackgroundSnapshot:
     duration: Distribution
 
     def as_dict(self) -> dict[str, object]:
-        return {
-            "steps": self.steps,
-            "worst_step_us": self.worst_step_us,
-            "duration_us": self.duration.as_dict(),
-            "overruns": self.overruns,
-            "finished": self.finished,
-            "last_error": self.last_error,
-        }
+        return _as_dict(self, "name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +81,7 @@ class IgnoredSnapshot:
     worst_lateness_us: float
 
     def as_dict(self) -> dict[str, object]:
-        return {
-            "ticks": self.ticks,
-            "caught_up": self.caught_up,
-            "skipped_ticks": self.skipped_ticks,
-            "overruns": self.overruns,
-            "slips": self.slips,
-            "worst_tick_us": self.worst_tick_us,
-            "worst_lateness_us": self.worst_lateness_us,
-        }
+        return _as_dict(self, "reason")
 
 
 @dataclass(frozen=True, slots=True)

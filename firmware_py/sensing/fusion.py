@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import asin, atan2, degrees
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from firmware_py.records import Array, Record, Records, field, new, record
+from firmware_py.records import Array, Record, new
 from firmware_py.sensing.attitude_params import gyroscope_error_state
-from firmware_py.sensing.fusion_filters import (
-    COMPLEMENTARY,
-    GYROSCOPE,
-    MADGWICK,
-    MAHONY,
-    TILT,
-    FusionParams,
-    FusionSample,
-    FusionState,
-    begin_fusion,
-    run_fusion,
-    step_fusion,
-)
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope, step_gyroscope
-from hal.compiled import kernel
 from hal.errors import BenchError
+from hal.plugins import FUSION, load, offered
 
 ALIGN_S = 0.1
-Method = Literal["tilt", "gyroscope", "complementary", "madgwick", "mahony", "error-state", "vqf"]
-NATIVE = {
-    "tilt": TILT,
-    "gyroscope": GYROSCOPE,
-    "complementary": COMPLEMENTARY,
-    "madgwick": MADGWICK,
-    "mahony": MAHONY,
-}
+METHODS = ("error-state", "vqf")
+"""Built-in filters. A source tree offers those of Erat 2018, too (``tools.research.endoscope.published_filters``)."""
 
 
 class FusionConfig(BaseModel):
@@ -46,7 +29,7 @@ class FusionConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: Method = "mahony"
+    method: str = "error-state"
     tau_s: float = Field(default=0.1, gt=0.0)
     """Time constant of the complementary filter."""
     beta: float = Field(default=0.03, ge=0.0)
@@ -60,29 +43,40 @@ class FusionConfig(BaseModel):
     align_s: float = Field(default=ALIGN_S, ge=0.0, le=10.0)
     """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
 
-
-@record
-class FusionMemory:
-    """The filter and one sample: each array handed to a kernel costs about 0.35 us a call, so a sample hands over
-    one."""
-
-    state: Records[FusionState] = field("", 1)
-    params: Records[FusionParams] = field("", 1)
-    rate: Array = field("rad/s", 3)
-    force: Array = field("any", 3)
-    dt_s: Array = field("s", 1)
-    field: Array = field("any", 3)
+    @field_validator("method")
+    @classmethod
+    def _known(cls, method: str) -> str:
+        known = (*METHODS, *sorted(offered(FUSION)))
+        if method in known:
+            return method
+        if method in ("tilt", "gyroscope", "complementary", "madgwick", "mahony"):
+            raise ValueError(f"'{method}' is a filter to compare with: only a source tree has it (tools/research)")
+        raise ValueError(f"'{method}' is no filter; there are {', '.join(known)}")
 
 
-@kernel
-def _step_one(memory: Records[FusionMemory]) -> None:
-    m = memory[0]
-    step_fusion(FusionSample(m.rate, m.force, m.field, m.dt_s[0]), m.state[0], m.params[0])
+@dataclass(frozen=True)
+class FusionFilter:
+    """A filter of the samples of one sensor, which a package offers in the group ``micron.fusion``.
+
+    ``memory(config, rate_hz)`` has the fields of ``GyroscopeMemory``, and in ``state`` at least ``quaternion`` and
+    ``aligned``. ``begin(memory)``, ``step(memory)`` and ``run(memory, rate, force, field, dt_s, out)`` are kernels as
+    those of ``gyroscope_filter``.
+    """
+
+    memory: Callable[[FusionConfig, float], Record]
+    begin: Callable[[Any], None]
+    step: Callable[[Any], None]
+    run: Callable[..., None]
 
 
-@kernel
-def _begin(state: Records[FusionState], params: Records[FusionParams]) -> None:
-    begin_fusion(state[0], params[0])
+def _error_state(config: FusionConfig, rate_hz: float) -> Record:
+    memory: Record = new(GyroscopeMemory)
+    memory["params"]["error_state"] = gyroscope_error_state()
+    memory["params"]["align_samples"] = round(config.align_s * rate_hz)
+    return memory
+
+
+ERROR_STATE = FusionFilter(_error_state, begin_gyroscope, step_gyroscope, run_gyroscope)
 
 
 class Fusion:
@@ -98,24 +92,10 @@ class Fusion:
         self.config = config
         self.rate_hz = rate_hz
         self._vqf: Any = _open_vqf(rate_hz) if config.method == "vqf" else None
-        params = new(
-            FusionParams,
-            method=NATIVE.get(config.method, MAHONY),
-            tau_s=config.tau_s,
-            beta=config.beta,
-            field_scale=config.field_scale,
-            kp=config.kp,
-            ki=config.ki,
-            align_samples=round(config.align_s * rate_hz),
-        )
-        self._kalman = config.method == "error-state"
-        if self._kalman:
-            self._memory: Record = new(GyroscopeMemory)
-            self._memory["params"]["error_state"] = gyroscope_error_state()
-            self._memory["params"]["align_samples"] = round(config.align_s * rate_hz)
-        else:
-            self._memory = new(FusionMemory, params=params)
-        self._state, self._params = (self._memory[name][0] for name in ("state", "params"))
+        found = None if config.method in METHODS else load(FUSION, config.method, FusionFilter)
+        self._filter = found or ERROR_STATE
+        self._memory = self._filter.memory(config, rate_hz)
+        self._state = self._memory["state"][0]
         self._rate, self._force, self._field, self._dt_s = (
             self._memory[name][0] for name in ("rate", "force", "field", "dt_s")
         )
@@ -130,13 +110,10 @@ class Fusion:
     def restart(self, start: Array | None = None) -> None:
         """Forget everything; the next samples align anew, or ``start`` (4,) is the attitude (not with "vqf" and
         "error-state")."""
-        if self._kalman:
-            begin_gyroscope(self._memory)
-        else:
-            _begin(self._state, self._params)
+        self._filter.begin(self._memory)
         if self._vqf is not None:
             self._vqf.resetState()
-        elif start is not None and not self._kalman:
+        elif start is not None and self._filter is not ERROR_STATE:
             self.quaternion[:] = np.asarray(start) / np.linalg.norm(start)
             self._state["aligned"] = 1
 
@@ -147,10 +124,8 @@ class Fusion:
         self._force[:] = force
         self._field[:] = np.nan if field is None else field
         self._dt_s[0] = self._period_s if dt_s is None else dt_s
-        if self._kalman:
-            step_gyroscope(self._memory)
-        elif self._vqf is None:
-            _step_one(self._memory)
+        if self._vqf is None:
+            self._filter.step(self._memory)
         else:
             self._state["aligned"] = 1
             self.quaternion[:] = self._vqf_step()
@@ -166,10 +141,8 @@ class Fusion:
         out = np.empty((n, 4))
         if n:
             w, f, b, dt = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, b, dt))
-            if self._kalman:
-                run_gyroscope(self._memory, w, f, b, dt, out)
-            elif self._vqf is None:
-                run_fusion(FusionSample(w, f, b, dt), out, self._state, self._params)
+            if self._vqf is None:
+                self._filter.run(self._memory, w, f, b, dt, out)
             else:
                 for k in range(n):
                     out[k] = self.step(w[k], f[k], b[k])

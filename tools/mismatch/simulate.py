@@ -21,13 +21,16 @@ from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Path, Run, Signal, Twin, fold
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.linear import roughness
 from tools.mismatch.twins.memo import remember
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
 START_PASSES = 8
 """Most passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
-SETTLED = 1e-5
-"""Change of an output by a pass, as a share of its range, below which no other is made."""
+SETTLED = 0.01
+"""Change of an output by a pass, as a share of the noise of its record, below which no other is made."""
+LEAST_CHANGE = 1e-6
+"""The same as a share of its range."""
 
 
 @dataclass(frozen=True)
@@ -582,14 +585,17 @@ def settle(first: Started, again: Callable[[dict[str, Signal], Run], Started], t
     effects, and passes lead away from it.
     """
     last, was = first, np.inf
+    measured = first[1].scale
+    least = {o: max(SETTLED * roughness(measured[o], first[1].lasting, o), LEAST_CHANGE) for o in first[0]}
     for _ in range(START_PASSES):
         outputs, run = again(*last)
-        pairs = [(fold(last[0][o], theta).value, fold(s, theta).value) for o, s in outputs.items()]
-        change = max(float(np.max(np.abs(b - a)) / max(np.ptp(b), 1e-300)) for a, b in pairs)
+        pairs = {o: (fold(last[0][o], theta).value, fold(s, theta).value) for o, s in outputs.items()}
+        shares = {o: float(np.max(np.abs(b - a)) / max(np.ptp(b), 1e-300)) for o, (a, b) in pairs.items()}
+        change = max(shares.values())
         if not (change < was or grows):
             break
         last, was = (outputs, run), change
-        if change <= SETTLED:
+        if all(share <= least[o] for o, share in shares.items()):
             break
     return last
 
@@ -600,12 +606,12 @@ def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:
     Start states are read off these outputs.
     """
     before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
-    return replace(run, measured=before, memo=_without_runs(run))
+    return replace(run, measured=before, recorded=run.scale, memo=_without_runs(run))
 
 
 def _without_runs(run: Run) -> dict[object, object]:
     """Return the cache of a run without what depends on its measured outputs."""
-    return {k: v for k, v in run.memo.items() if k == ("about", run.starts)}
+    return {"lasting": run.lasting}
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from firmware_py.records import attributes, new
-from firmware_py.sensing import fusion_filters
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
 from firmware_py.sensing.quaternion import from_matrix
+from tools.research.endoscope import published_filters
 from tools.research.reproduce.broad_trials import read_trial
 from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 
@@ -34,7 +34,7 @@ def still(n: int, roll_deg: float, pitch_deg: float = 0.0) -> tuple[Array, Array
 
 @pytest.mark.parametrize("method", [*FILTERS, "error-state", "vqf"])
 def test_starts_from_the_mean_of_the_first_tenth_of_a_second(method: str) -> None:
-    fusion = Fusion(FusionConfig(method=method), RATE_HZ)  # type: ignore[arg-type]
+    fusion = Fusion(FusionConfig(method=method), RATE_HZ)
     rate, force = still(200, 30.0, -20.0)
     q = fusion.run(rate, force)
     assert fusion.aligned
@@ -47,8 +47,8 @@ def test_starts_from_the_mean_of_the_first_tenth_of_a_second(method: str) -> Non
 def test_live_and_batch_are_the_same_numbers(method: str) -> None:
     rng = np.random.default_rng(1)
     rate, force = rng.normal(0.0, 0.5, (60, 3)), gravity(10.0, 5.0) + rng.normal(0.0, 1.0, (60, 3))
-    batch = Fusion(FusionConfig(method=method), RATE_HZ).run(rate, force)  # type: ignore[arg-type]
-    live = Fusion(FusionConfig(method=method), RATE_HZ)  # type: ignore[arg-type]
+    batch = Fusion(FusionConfig(method=method), RATE_HZ).run(rate, force)
+    live = Fusion(FusionConfig(method=method), RATE_HZ)
     for k in range(60):
         assert np.array_equal(live.step(rate[k], force[k]), batch[k])
 
@@ -146,7 +146,7 @@ def test_madgwick_steps_along_the_gradient(with_field: bool) -> None:
 @pytest.mark.parametrize("method", ["madgwick", "mahony"])
 def test_a_magnetometer_holds_the_heading(method: str) -> None:
     north = np.array([20.0, 0.0, -45.0])
-    config = FusionConfig(method=method, beta=0.2, kp=2.0)  # type: ignore[arg-type]
+    config = FusionConfig(method=method, beta=0.2, kp=2.0)
     fusion = Fusion(config, RATE_HZ)
     half = math.radians(-30.0) / 2
     fusion.restart(np.array([math.cos(half), 0.0, 0.0, math.sin(half)]))
@@ -168,7 +168,7 @@ def test_the_error_state_filter_finds_the_bias_at_rest_without_a_magnetometer() 
 
 @pytest.mark.parametrize("method", FILTERS)
 def test_free_fall_and_standstill_do_not_break_it(method: str) -> None:
-    fusion = Fusion(FusionConfig(method=method, align_s=0.0), RATE_HZ)  # type: ignore[arg-type]
+    fusion = Fusion(FusionConfig(method=method, align_s=0.0), RATE_HZ)
     q = fusion.run(np.zeros((20, 3)), np.zeros((20, 3)))
     np.testing.assert_array_equal(q, np.tile([1.0, 0.0, 0.0, 0.0], (20, 1)))
     # exactly level: Madgwick's gradient is zero (erratum 107)
@@ -201,11 +201,11 @@ def test_kernel_and_python_agree(method: str) -> None:
     n = 30
     rate, force, field = rng.normal(size=(n, 3)), rng.normal((0.0, 0.0, 9.8), 1.0, (n, 3)), rng.normal(size=(n, 3))
     field[::3] = np.nan
-    config = FusionConfig(method=method)  # type: ignore[arg-type]
+    config = FusionConfig(method=method)
     compiled = Fusion(config, RATE_HZ)
     out = compiled.run(rate, force, field)
     params = new(
-        fusion_filters.FusionParams,
+        published_filters.FusionParams,
         method=FILTERS.index(method),
         tau_s=config.tau_s,
         beta=config.beta,
@@ -214,12 +214,12 @@ def test_kernel_and_python_agree(method: str) -> None:
         ki=config.ki,
         align_samples=10,
     )
-    state = new(fusion_filters.FusionState)
+    state = new(published_filters.FusionState)
     s, p = attributes(state)[0], attributes(params)[0]
-    fusion_filters.begin_fusion.py_func(s, p)
+    published_filters.begin_fusion.py_func(s, p)
     for k in range(n):
-        fusion_filters.step_fusion.py_func(
-            fusion_filters.FusionSample(rate[k], force[k], field[k], 1.0 / RATE_HZ), s, p
+        published_filters.step_fusion.py_func(
+            published_filters.FusionSample(rate[k], force[k], field[k], 1.0 / RATE_HZ), s, p
         )
         np.testing.assert_allclose(s.quaternion, out[k], atol=1e-14)
 
@@ -256,3 +256,9 @@ def test_broad_errors_are_the_published_ones(shared_data: Path, trial: str) -> N
     if trial == "02":
         q = gyroscope_attitude(rate, force, field, 1.0 / 0.0035, "madgwick")
         assert read.errors_deg(q)[0] < 3.0
+
+
+def test_an_installed_wheel_says_where_a_published_filter_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("firmware_py.sensing.fusion.offered", lambda group: {})
+    with pytest.raises(ValueError, match="'mahony' is a filter to compare with: only a source tree has it"):
+        FusionConfig(method="mahony")

@@ -101,4 +101,4 @@ def run_pushed(ad, pushed, x0, starts, stop):
     return out
 
 
-__all__: Sequence[str] = ["Steps", "exact_steps", "is_affine"]
+__all__: Sequence[str] = ["Steps", "exact_steps", "is_affine", "run_pushed"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,7 @@ class Run:
     sample numbers of which alone a response may consist (None: it consists of all). ``paths``: of the outputs that were
     measured behind effects, linear ones for a linear run; ``about``: an earlier run of these outputs (n,), else
     zeros. ``beside``: what is added behind each output per unit of a weight; start states are read off the rest;
-    ``beside_token`` identifies it.
+    ``beside_token`` identifies it. ``recorded``: outputs (n,) as recorded, where ``measured`` has been corrected.
     """
 
     t: Array
@@ -97,6 +97,7 @@ class Run:
     about: Mapping[str, Array] = field(default_factory=dict[str, Array])
     beside: Mapping[str, Mapping[int, Array]] = field(default_factory=dict[str, Mapping[int, Array]])
     beside_token: tuple[object, ...] = ()
+    recorded: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
     def behind_path(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""
@@ -106,6 +107,18 @@ class Run:
         full = self.about[output].copy() if output in self.about else np.zeros(self.t.size)
         full[at] = y
         return path.carry(full)[at]
+
+    @property
+    def scale(self) -> Mapping[str, Array]:
+        """Return the outputs (n,) that show size and noise of a record: the same for all corrections of it."""
+        return self.recorded or self.measured
+
+    @property
+    def lasting(self) -> dict[object, object]:
+        """Return the cache of what depends on no measured output."""
+        kept = self.memo.setdefault("lasting", {})
+        assert isinstance(kept, dict)
+        return cast("dict[object, object]", kept)
 
     @property
     def start_window(self) -> int:

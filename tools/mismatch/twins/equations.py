@@ -83,6 +83,11 @@ class Equations(Protocol):
         """Return True if the derivatives are affine in states and signals and do not depend on time."""
         ...
 
+    @property
+    def reads_affine(self) -> bool:
+        """Return the same of the outputs."""
+        ...
+
     def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
         """Return the states (n, s) of a free run; ``values`` are the parameters, ``limits`` those of each state."""
         ...
@@ -109,6 +114,11 @@ class Programs:
     def affine(self) -> bool:
         """See Equations."""
         return is_affine(self.rates_program, self.at - 1)
+
+    @property
+    def reads_affine(self) -> bool:
+        """See Equations."""
+        return is_affine(self.outputs, self.at - 1)
 
     def states(self, x0: Array, drive: Drive, values: Array, inside: Inside, limits: tuple[Array, Array]) -> Array:
         """See Equations."""
@@ -187,6 +197,7 @@ def meet_start(
     """
     s, step = x0.shape[1], 1e-4
     first = np.searchsorted(rows, np.arange(x0.shape[0]))
+    edges = list(zip(first.tolist(), [*first[1:].tolist(), rows.size], strict=True))
 
     def together(e: Array) -> Array:
         return np.add.reduceat(e, first, axis=0)
@@ -194,8 +205,9 @@ def meet_start(
     best = misses(x0)
     for _ in range(rounds):
         slopes = np.stack([(best - misses(x0 + step * typical * np.eye(s)[i])) / step for i in range(s)], axis=-1)
-        gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
-        cross = together(np.einsum("rqi,rq->ri", slopes, best))
+        columns = [(slopes[a:b].reshape(-1, s), best[a:b].reshape(-1)) for a, b in edges]
+        gram = np.stack([c.T @ c for c, _ in columns])
+        cross = np.stack([c.T @ y for c, y in columns])
         whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
         size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
         determined = size > LEAST_SHOWN**2 * size[:, -1:]
@@ -205,7 +217,7 @@ def meet_start(
         after = misses(moved)
         was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
         better = now < was
-        foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
+        foretold = np.array([np.sum((y - c @ step) ** 2) for (c, y), step in zip(columns, turn, strict=True)])
         x0 = np.where(better[:, None], moved, x0)
         best = np.where(better[rows][:, None], after, best)
         # linear equations need a single step

@@ -438,7 +438,7 @@ def start_state(ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = Tr
     behind the start do, as long as the start is felt. Without ``whole``, free responses reach over the windows
     only: states can be had, responses cannot. ``blocks``: of a block-diagonal ``ad``.
     """
-    starts, n, window, setting, memo = run.starts, run.t.size, run.start_window, run.setting, run.memo
+    starts, n, window, setting, memo = run.starts, run.t.size, run.start_window, run.setting, run.lasting
     how = ("set", setting.size) if setting is not None else ("window", window)
     paths = {o: p for o, p in run.paths.items() if o in rows}
     passed = tuple((o, p.token) for o, p in paths.items())
@@ -462,10 +462,10 @@ def start_state(ad: Array, rows: dict[str, Array], run: Run, *, whole: bool = Tr
     if len(rows) > 1:
         # outputs of different units weigh alike over the samples that may set the state
         seen = np.concatenate(at)
-        weight = {o: 1.0 / (float(np.std(run.measured[o][seen])) or 1.0) for o in rows}
+        weight = {o: 1.0 / (float(np.std(run.scale[o][seen])) or 1.0) for o in rows}
     rough = max(
         LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW,
-        *(_roughness(run.measured[o], memo, o) for o in rows),
+        *(roughness(run.scale[o], memo, o) for o in rows),
     )
     # outputs that show the states alike share the inverse
     same = ("solvers", ad.tobytes(), tuple((c.tobytes(), weight[o]) for o, c in rows.items()), rough, *key[3:])
@@ -539,7 +539,7 @@ OCTAVE = 128
 """Number of samples of a free response in every octave of time since its start."""
 
 
-def _roughness(x: Array, memo: dict[object, object], output: str) -> float:
+def roughness(x: Array, memo: dict[object, object], output: str) -> float:
     """Return the noise of a record over its range, by the median of its second differences; cached."""
     key = ("roughness", output)
     found = memo.get(key)

@@ -15,7 +15,7 @@ from sim_devices.physics.forces import FLOW, UNCENTRED
 from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.affine import Steps, exact_steps
+from tools.mismatch.twins.affine import Steps, exact_steps, run_pushed
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.equations import (
     LEAST_SHOWN,
@@ -33,7 +33,7 @@ from tools.mismatch.twins.forced import shot_to_repeat
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
-from tools.mismatch.twins.memo import remember
+from tools.mismatch.twins.memo import remember, stored
 from tools.mismatch.twins.ode_run import SWAY, Drive
 
 MOST_SUBSTEPS = 200
@@ -92,9 +92,13 @@ class OdeTwin(Head):
 
     def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
         """See Twin."""
+        return {UNCENTRED: (1.0,)} if self._is_free else {}
+
+    @cached_property
+    def _is_free(self) -> bool:
+        """Return True if nothing holds a position of the equations as given."""
         a = self.linearised(self.start_values).a
-        free = any(p.kind == "motion" and a[p.target, p.position] == 0.0 for p in self.places)
-        return {UNCENTRED: (1.0,)} if free else {}
+        return any(p.kind == "motion" and a[p.target, p.position] == 0.0 for p in self.places)
 
     @cached_property
     def start_values(self) -> Array:
@@ -280,7 +284,13 @@ class OdeTwin(Head):
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
 
-        steps = self.exact_steps(run.dt, values) if self.has_exact_steps and not forces else None
+        steps = None
+        if self.has_exact_steps and not forces:
+            key = ("steps", values.tobytes())
+            steps = run.lasting.get(key)
+            if not isinstance(steps, Steps):
+                steps = self.exact_steps(run.dt, values)
+                stored(run.lasting, key, steps, steps.ad.nbytes)
 
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
             if steps is not None:
@@ -302,6 +312,23 @@ class OdeTwin(Head):
             begin = shot_to_repeat(once, full, np.repeat(given, starts.size, axis=0), u, starts, run.period)
             if begin is not None:
                 return go(begin, starts, ends, u, run.t)
+
+        def plain() -> Array:
+            # a run of the engineer's own model from its own start gives first guesses for later stretches
+            end = np.array([run.t.size], np.int64)
+            drive = Drive(u, self.held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
+            return self.equations.states(given, drive, self.start_values, NOTHING, limits)[starts]
+
+        x0 = remember(run.lasting, ("about", run.starts), plain)
+        x0 = np.where(np.isfinite(x0), x0, given)
+        reading = remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
+        if steps is not None and self.reads_affine and all(p.is_linear for p in run.paths.values()):
+            x = steps.run(x0, u, starts, ends)
+            y = self.equations.readings(x, u, run.t, values)
+            rows = dict(zip(self.outputs, reading, strict=True))
+            ss = start_state(steps.ad, rows, run if self.integrates else replace(run, setting=None))
+            missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
+            return x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
         # the windows that set the state are simulated alone, one after the other
         stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
@@ -316,14 +343,7 @@ class OdeTwin(Head):
             x = go(x0, before, after, part, t)
             return (y - self._behind_paths(run, self.equations.readings(x, part, t, values), seen)) * weight
 
-        def plain() -> Array:
-            # a run of the engineer's own model from its own start gives first guesses for later stretches
-            end = np.array([run.t.size], np.int64)
-            drive = Drive(u, self.held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
-            return self.equations.states(given, drive, self.start_values, NOTHING, limits)[starts]
-
-        x0 = remember(run.memo, ("about", run.starts), plain)
-        x0 = self.as_read(np.where(np.isfinite(x0), x0, given), y[before], part[before], t[before], values)
+        x0 = self.as_read(x0, y[before], part[before], t[before], values, reading)
         x0 = meet_start(x0, misses, rows, self.typical, limits)
         if run.setting is None or not self.integrates:
             return go(x0, starts, ends, u, run.t)
@@ -368,16 +388,21 @@ class OdeTwin(Head):
         """Return True if the equations without forces are affine and no state has limits."""
         return self.equations.affine and all(s.lowest == -np.inf and s.highest == np.inf for s in self.state_list)
 
+    @cached_property
+    def reads_affine(self) -> bool:
+        """Return True if the outputs are affine in states and signals."""
+        return self.equations.reads_affine
+
     def exact_steps(self, dt: float, values: Array) -> Steps:
         """Return the steps of affine equations for these numbers."""
         return exact_steps(lambda x, u: self.equations.rates(x, u, values), self.typical, self.middle[1], dt, self.held)
 
-    def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array) -> Array:
-        """Move states (k, s) as little as possible so that the outputs (k, q) equal the measurement.
+    def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array, c: Array) -> Array:
+        """Move states (k, s) as little as possible so that the outputs (k, q), of slopes ``c`` (q, s), are as measured.
 
         A run that has drifted away does not determine the start of the next one in a position-dependent force.
         """
-        reading = self.linearised(values).c * self.typical
+        reading = c * self.typical
         gap = y - self.equations.readings(np.ascontiguousarray(x), np.ascontiguousarray(u), t, values)
         return x + gap @ np.linalg.pinv(reading, rcond=LEAST_SHOWN).T * self.typical
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from firmware_py.records import Record, new
 from firmware_py.sensing.attitude import restart
 from firmware_py.sensing.attitude_filter import Motion
 from firmware_py.sensing.attitude_params import gyroscope_error_state, gyroscope_quaternion_kalman
-from firmware_py.sensing.fusion import ALIGN_S, Fusion, FusionConfig, Method
+from firmware_py.sensing.fusion import ALIGN_S, Fusion, FusionConfig
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope
 from firmware_py.sensing.quaternion import from_matrix
 from firmware_py.sensing.quaternion_kalman import begin_quaternion_kalman, quaternion_kalman_step
@@ -65,7 +63,7 @@ def gyroscope_attitude(
     force: NDArray[np.float64],
     field: NDArray[np.float64],
     rate_hz: float,
-    method: Literal["error-state", "quaternion-kalman"] | Method = "error-state",
+    method: str = "error-state",
     gravity_m_s2: float = 9.81,
     setting: Record | None = None,
 ) -> NDArray[np.float64]:
