@@ -30,6 +30,9 @@ def test_a_stranger_with_five_days(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (play,) = together["physics"]
     assert play["name"] == "backlash"
     assert play["parameters"]["gap"]["value"] == pytest.approx(12.0, rel=0.1)
+    alike = {n for e in together["equivalent"] for n in e["names"]}
+    assert {"backlash", "hysteresis"} <= alike
+    assert not alike & {"clock_skew", "slew_limit"}  # they gain less than half of what the play gains
     (change,) = together["together"]["changes"]
     assert change["condition"] == "temperature_C"
     assert change["relative"] == pytest.approx(-0.004, rel=0.1)

@@ -22,6 +22,10 @@ from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
 """Largest ratio of a rival's held-out residual rms to that of the named set at which the rival fits as well."""
+KEPT = 0.5
+"""Largest share of the named effect's own gain (log of the held-out rms) that a rival that fits as well may lack, as a
+trial of non-inferiority keeps half of what the known remedy does (FDA, Non-Inferiority Clinical Trials, 2016, IV.A.3).
+The margin alone would call every effect equal to one that gains less than the margin."""
 TESTED, DEEPEST = 6, 30
 """Number of sets of names, best first, whose every name is tested; and the number if none has passed so far."""
 CURVE = 12
@@ -174,10 +178,16 @@ def stated(p: float, known: bool, c: Constants) -> float:
 def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
     """Return the sets with one name of ``chosen`` replaced by another, best first.
 
-    Equivalence is a paired test on held-out blocks with a margin; fewer parameters give a rival no advantage.
+    Equivalence is a paired test on held-out blocks with a margin, which is less for a weak effect (``KEPT``); fewer
+    parameters give a rival no advantage.
     """
     p = store.problem
     chosen_rms = held_rms(p, chosen.fitted)
+    margins: dict[str, dict[str, float]] = {}
+    for name in sorted(chosen.names):
+        without = held_rms(p, store.without(chosen, lambda e, n=name: e.effect.name == n).fitted)
+        gains = {o: math.log(max(without[o] / max(rms, 1e-300), 1.0)) for o, rms in chosen_rms.items()}
+        margins[name] = {o: min(math.log(MARGIN), KEPT * v) for o, v in gains.items()}
     out: list[Rival] = []
     for s in store.ranked():
         gone, new = chosen.names - s.names, s.names - chosen.names
@@ -191,8 +201,9 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
         ratio = rival_rms[output] / max(chosen_rms[output], 1e-300)
         worse = (chosen.blocks - s.blocks).sum(axis=1)
         spread = float(np.std(worse, ddof=1) / math.sqrt(worse.size)) if worse.size > 1 else math.inf
-        within = float(np.mean(worse)) + 1.645 * spread < math.log(MARGIN) * len(set(touched))
-        out.append(Rival(s, name, instead, output, ratio, ratio <= MARGIN and within))
+        margin = margins[instead]
+        within = float(np.mean(worse)) + 1.645 * spread < sum(margin[o] for o in set(touched))
+        out.append(Rival(s, name, instead, output, ratio, within and math.log(max(ratio, 1e-300)) <= margin[output]))
     return tuple(out[:8])
 
 
