@@ -11,7 +11,7 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import NamedTuple, cast
 
-OWN = "micron-bench"
+OWN = ("micron-bench", "micron-research")
 PYPROJECT = Path(__file__).resolve().parents[3] / "pyproject.toml"
 COPYLEFT = re.compile(r"\b(LGPL|GPL|AGPL|MPL|Lesser General|Mozilla|General Public)", re.IGNORECASE)
 
@@ -57,7 +57,7 @@ def parts(found: Iterable[Distribution], named: Mapping[str, str]) -> list[Part]
     for d in found:
         name = d.metadata["Name"]
         key = _plain(name)
-        if key != OWN:
+        if key not in OWN:
             rows[key] = Part(name, d.version, licence_of(d), key in named, named.get(key, ""))
     return [rows[key] for key in sorted(rows)]
 
