@@ -12,6 +12,7 @@ import itertools
 import json
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -142,8 +143,17 @@ def _has_false_name(row: dict[str, Any]) -> bool:
     return len(set(row["names"])) > expected
 
 
-def page(rows: Sequence[dict[str, Any]], samples: int) -> str:
-    """Return the result's page."""
+def not_run(rows: Sequence[dict[str, Any]], families: int, nulls: int) -> str:
+    """Return the number of families of each twin that are not in ``rows``, in words; "none" if all are."""
+    done = {(r["null"], r["index"]) for r in rows}
+    twins = [plan_of(0, k, null=n).twin for n, count in ((False, families), (True, nulls)) for k in range(count)]
+    left = Counter(twins)
+    left.subtract(plan_of(0, k, null=n).twin for n, k in done)
+    return ", ".join(f"{v} of a {twin.replace('_', ' ')}" for twin, v in left.items() if v > 0) or "none"
+
+
+def page(rows: Sequence[dict[str, Any]], samples: int, families: int, nulls: int) -> str:
+    """Return the result's page; ``families`` and ``nulls`` are the numbers that were asked for."""
     drawn, seed = [r for r in rows if r["drawn"]], rows[0]["seed"]
     revisions = "; ".join(dict.fromkeys(r["revision"] for r in rows))
     missed = [
@@ -156,8 +166,8 @@ def page(rows: Sequence[dict[str, Any]], samples: int) -> str:
     false = [f"- null of a {r['twin']}: {', '.join(r['names'])}" for r in drawn if r["null"] and r["names"]]
     return f"""# Many recordings at once
 
-Made by `python -m tools.research.prove.together --seed {seed} --keep FOLDER --out docs/results/together.json`,
-revision {revisions}; do not edit.
+Made by `python -m tools.research.prove.together --seed {seed} --families {families} --nulls {nulls} --keep FOLDER
+--out docs/results/together.json`, revision {revisions}; do not edit.
 
 A family is one drawn case of at most {samples} samples whose effect has {SEVERITY:g} noise rms after a re-fit, cut into
 {LEAST} to {MOST} recordings that are diagnosed together. Null families have no effect; every third of them needs
@@ -166,6 +176,7 @@ recalibration.
 {table(rows)}
 
 - {len(rows) - len(drawn)} of {len(rows)} families could not be drawn.
+- Not run of {families} families and {nulls} nulls, for lack of processor time: {not_run(rows, families, nulls)}.
 - CPU: {sum(r["cpu_s"] for r in drawn):.0f} s.
 
 ## Not named
@@ -205,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     print(table(rows))
     if options.out is not None:
-        write_result(options.out, page(rows, options.samples))
+        write_result(options.out, page(rows, options.samples, options.families, options.nulls))
 
 
 if __name__ == "__main__":
