@@ -100,7 +100,6 @@ class Hmc2003Options(Options):
     """Holds the keys of an HMC-2003: the ADC channels of x, y, z. Two digital outputs of the DAQ drive its strap."""
 
     channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
-    strap_daq: str = "daq"
 
 
 class AmplifierMonitorOptions(Options):

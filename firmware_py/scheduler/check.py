@@ -16,6 +16,7 @@ from firmware_py.scheduler.task import BackgroundSpec, TaskSpec
 from hal.errors import BenchError
 
 MAX_HYPERPERIOD_TICKS = 10_000
+BUDGET = "a budget ([firmware.budget_us])"
 
 
 def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec], period_ns: int) -> int:
@@ -43,13 +44,14 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
         if load_ns[worst] > task.deadline_ns:
             raise BenchError(
                 f"task {task.name!r} cannot meet its deadline of {task.deadline_us:g} us in tick {worst} "
-                f"of {hyperperiod}: {_sum_text(ordered, worst, upto=task)}. Shorten a budget, move a phase or an order"
+                f"of {hyperperiod}: {_sum_text(ordered, worst, upto=task)}. Lower tick_hz or {BUDGET}, or move "
+                "a phase or an order"
             )
     worst = int(np.argmax(load_ns))
     if load_ns[worst] > period_ns:
         raise BenchError(
             f"the budgets do not fit tick {worst} of {hyperperiod}: {_sum_text(ordered, worst)} "
-            f"> {period_ns / 1000:g} us. Shorten a budget or move a phase"
+            f"> {period_ns / 1000:g} us. Lower tick_hz or {BUDGET}, or move a phase"
         )
     load_ns = _with_waiting(load_ns, [task for task in in_order(tasks) if task.deferrable], period_ns)
     slack_ns = period_ns - int(load_ns.min())
@@ -81,7 +83,7 @@ def _with_waiting(load_ns: NDArray[np.int64], tasks: Sequence[TaskSpec], period_
                 raise BenchError(
                     f"task {name!r} finds no room of {task.budget_us:g} us within {task.deferrable} ticks of the one "
                     f"in which it is due (tick {index} of {hyperperiod} is full with {full_ns[index] / 1000:g} of "
-                    f"{period_ns / 1000:g} us). Lower a rate of the bench file, or shorten a budget"
+                    f"{period_ns / 1000:g} us). Lower a rate of the bench file, or {BUDGET}"
                 )
     return full_ns
 

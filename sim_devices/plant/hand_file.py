@@ -146,7 +146,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
         try:
             values[n - 2] = [float(v) for v in row]
         except ValueError as error:
-            raise HandFileError(f"{path} line {n}: {error}") from None
+            raise HandFileError(f"{path} line {n}: {error}; correct or delete this line") from None
     return {h: values[:, i] for i, h in enumerate(header)}
 
 

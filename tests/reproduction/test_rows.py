@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,33 @@ def test_trials_that_are_not_given_are_read(tmp_path: Path, monkeypatch: pytest.
     assert (trial.name, trial.disturbed, trial.counts.tolist()) == ("35", True, [False, True, True, False, True])
     np.testing.assert_array_equal(trial.rate, arrays["imu_gyr"])
     np.testing.assert_array_equal(trial.truth, arrays["opt_quat"])
+
+
+@dataclass(frozen=True)
+class KnownTrial:
+    """A trial with total, heading and inclination errors in deg: ours and vqf's."""
+
+    name: str
+    disturbed: bool
+    ours: tuple[float, float, float]
+    vqf: tuple[float, float, float]
+
+    def errors_deg(self, _: object) -> tuple[float, float, float]:
+        return self.ours
+
+
+def test_the_mean_of_disturbed_trials_names_the_one_that_decides_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = [
+        KnownTrial("24", True, (1.0, 0.9, 0.2), (2.0, 1.9, 0.2)),
+        KnownTrial("27", True, (7.0, 6.9, 0.3), (7.0, 6.5, 0.3)),
+        KnownTrial("05", False, (9.0, 9.0, 0.1), (1.0, 1.0, 0.1)),
+    ]
+    monkeypatch.setattr(broad, "trials_not_given", lambda _: every)
+    monkeypatch.setattr(broad, "vqf_errors_deg", lambda trial: trial.vqf)
+    monkeypatch.setattr(broad, "attitude", lambda _: None)
+    whole, disturbed, *_ = broad.rows_not_given()
+    assert disturbed.why == "0.89 x vqf; 0.50 without trial 27 (heading off by 6.9 deg, vqf's by 6.5)"
+    assert whole.why == "1.70 x vqf"
 
 
 def test_gravity_behind_a_known_turn_is_off_by_what_the_scale_is_wrong() -> None:

@@ -144,6 +144,12 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             ),
             Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
             Key(
+                "offsets",
+                "table of numbers",
+                "what each output shows at zero; re-fitted, unless fixed lists <output>_offset",
+                "0",
+            ),
+            Key(
                 "function",
                 "file.py:name",
                 "derivatives(t, states, inputs, parameters) in place of equations; each is a mapping by name, and so is"

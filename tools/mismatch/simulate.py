@@ -396,7 +396,8 @@ class Model:
                 drive = self.twin.drive(o)
                 by = inputs[drive] if self.twin.static and drive else None
                 was = found[o]
-                now = self._pass(run, k, was, by, o, how, run.beside.get(o, ()) if self.curved else ())
+                around = run.beside.get(o, ()) if self.curved else ()
+                now = self._pass(run, k, was, by, o, how, kept=around)
                 # with weights the outputs of a linear twin would be affine in them no more
                 afresh = inside.integrates if inside is not None else self.twin.restart and not pl.parts.weights
                 linear = o in run.paths and run.paths[o].is_linear
@@ -445,7 +446,7 @@ class Model:
                 continue
             kept = {j for k in behind for j in range(self._slices[k][1].start, self._slices[k][1].stop)}
             for k in behind:
-                still = self._pass(run, k, still, None, o, how, kept)
+                still = self._pass(run, k, still, None, o, how, kept=kept)
             if still.columns:
                 found[o] = dict(still.columns)
                 tokens.append((o, still.token))
@@ -516,7 +517,7 @@ class Model:
         return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)
 
     def _pass(
-        self, run: Run, k: int, x: Signal, by: Signal | None, output: str, how: Pass, kept: Collection[int] = ()
+        self, run: Run, k: int, x: Signal, by: Signal | None, output: str, how: Pass, *, kept: Collection[int] = ()
     ) -> Signal:
         """Return ``x`` behind placed effect ``k``; the columns ``kept`` go round a driven effect with weights."""
         theta = how.theta

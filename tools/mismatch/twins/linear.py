@@ -512,6 +512,8 @@ def held_inverse(seen: Array, whole: Array, rough: float) -> Array:
     Rank-Deficient and Discrete Ill-Posed Problems, 1998). It is smooth in the poles, and combinations that the data
     determine have no bias. The result does not depend on the coordinates of the state.
     """
+    if not np.all(np.isfinite(whole)) or not np.all(np.isfinite(seen)):
+        return np.zeros((seen.shape[1], seen.shape[0]))  # a trial that runs away shows nothing
     size = np.maximum(np.max(np.abs(whole), axis=0, initial=0.0), 1e-300)
     responses, strength, combine = np.linalg.svd(whole / size, full_matrices=False)
     kept = strength > NUMERICAL_RANK * strength[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +43,8 @@ FORGOTTEN = 20.0  # least number of time constants in a record; a slower state i
 class OdeTwin(Head):
     """Simulates differential equations.
 
-    ``signals``: inputs of the equations, then context. ``given``: the ``[twin.parameters]`` table, ``names`` its
-    numbers in the order of the equations, ``free`` the indices of those that may be re-fitted.
+    ``signals``: inputs of the equations, then context. ``given``: the engineer's numbers by name, and the offset of
+    every output; ``names``: these in the order of the equations, ``free``: the indices of those that may be re-fitted.
     """
 
     equations: Equations
@@ -53,7 +52,7 @@ class OdeTwin(Head):
     signals: tuple[str, ...]
     names: tuple[str, ...]
     free: tuple[int, ...]
-    given: Mapping[str, Any]
+    given: Mapping[str, float]
     holds: Holds
     text_of: Callable[[Mapping[str, float]], dict[str, object]] = field(repr=False)
     parameter_units: Mapping[str, str]
@@ -78,11 +77,11 @@ class OdeTwin(Head):
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
-        return np.array([float(self.given[self.names[i]]) for i in self.free])
+        return np.array([self.given[self.names[i]] for i in self.free])
 
     def values(self, theta: Array) -> Array:
         """Return the numbers of the equations for base parameters ``theta`` (further entries are ignored)."""
-        out = np.array([float(self.given[n]) for n in self.names])
+        out = np.array([self.given[n] for n in self.names])
         out[list(self.free)] = theta[: len(self.free)]
         return out
 
@@ -103,7 +102,7 @@ class OdeTwin(Head):
     @cached_property
     def start_values(self) -> Array:
         """Return the engineer's own numbers."""
-        return np.array([float(self.given[n]) for n in self.names])
+        return np.array([self.given[n] for n in self.names])
 
     def sensitivity(self, output: str, theta: Array) -> float:
         """See Twin: what effects at an input carry is in input units."""

@@ -11,7 +11,7 @@ from tools.errors import RecordingError
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.holds import holds_text
 from tools.mismatch.twins.ode import OdeTwin
-from tools.mismatch.twins.ode_text import ode_twin
+from tools.mismatch.twins.ode_text import ode_twin, offset_name
 from tools.mismatch.twins.state_space import Matrices
 
 STRUCTURE = (0.0, 1.0, -1.0)
@@ -55,12 +55,10 @@ def physical_twin(recording: Recording, m: Matrices) -> OdeTwin:
     readings: dict[str, str] = {}
     for k, o in enumerate(outputs):
         parts = [*terms("C", k, m.c[k], names), *terms("D", k, m.d[k], inputs)]
-        if m.y0[k] != 0.0:
-            name = f"y0_{k + 1}"
-            numbers[name], at[name] = float(m.y0[k]), ("y0", k, 0)
-            parts.append(name)
+        at[offset_name(o)] = ("y0", k, 0)
         readings[o] = " + ".join(parts) or "0"
     text = {**numbers, "states": states, "equations": equations, "outputs": readings, "hold": holds_text(m.holds)}
+    text["offsets"] = dict(zip(outputs, m.y0.tolist(), strict=True))
     given = recording.twin.parameters
     twin = ode_twin(replace(recording, twin=replace(recording.twin, parameters=text)))
 

@@ -24,7 +24,7 @@ from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.program import parse
 
-TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")
+TABLES = ("states", "equations", "outputs", "offsets", "units", "function", "fixed", "hold")
 """Keys of an ode twin that are not numbers; they stand beside ``parameters`` in ``[twin]``, or inside it."""
 PROBES = 5
 
@@ -44,26 +44,48 @@ def ode_twin(recording: Recording) -> OdeTwin:
     for name in (*(s.name for s in states), *signals, *names):
         if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name) or name in ("t", "pi"):
             raise RecordingError(f"{where} '{name}' cannot be used in an equation; give it another name")
-    every = ["t", *(s.name for s in states), *signals, *names]
+    offsets = _offsets(where, recording, table)
+    every = ("t", *(s.name for s in states), *signals, *names, *offsets)
     twice = {n for n in every if every.count(n) > 1}
     if twice:
         raise RecordingError(f"{where} '{twice.pop()}' names two things among states, signals and parameters")
     try:
-        equations = _programs(recording, table, states, signals, names, tuple(every))
+        equations = _programs(recording, states, signals, names, offsets)
     except EquationError as error:
         raise RecordingError(f"{where} {error}") from None
-    return assembled(recording, equations, states, signals, names)
+    return _assembled(recording, equations, states, signals, names, offsets)
 
 
-def assembled(
+def _offsets(where: str, recording: Recording, table: Mapping[str, Any]) -> dict[str, float]:
+    """Return the offset of every output, under the name that it has as a parameter.
+
+    A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve.
+    """
+    given = table.get("offsets", {})
+    if not isinstance(given, Mapping) or any(o not in recording.outputs or not _number(v) for o, v in given.items()):
+        raise RecordingError(
+            f"{where} offsets must give a number for an output ({', '.join(recording.outputs)}), got {given!r}"
+        )
+    return {offset_name(o): float(given.get(o, 0.0)) for o in recording.outputs}
+
+
+def offset_name(output: str) -> str:
+    """Return the name of the offset of an output among the parameters."""
+    return f"{output}_offset"
+
+
+def _assembled(
     recording: Recording,
     equations: Equations,
     states: tuple[State, ...],
     signals: tuple[str, ...],
-    names: Sequence[str],
+    own: Sequence[str],
+    offsets: Mapping[str, float],
 ) -> OdeTwin:
-    """Build the twin around equations of any origin, with typical sizes from a run as given."""
+    """Build the twin around its equations, with typical sizes from a run as given; ``own``: the engineer's numbers."""
     table, where = recording.twin.parameters, f"{recording.path}: [twin]"
+    names = (*own, *offsets)
+    numbers = {**{n: float(table[n]) for n in own}, **offsets}
     holds = read_holds(recording, STRAIGHT_OR_HELD)
     held = np.array([holds.get(s) == "zero" for s in signals])
     fixed = table.get("fixed", [])
@@ -73,7 +95,9 @@ def assembled(
     if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
         raise RecordingError(f"{where} units must give the unit of each parameter as text")
     free = tuple(i for i, n in enumerate(names) if n not in fixed)
-    values = np.array([float(table[n]) for n in names])
+    values = np.array([numbers[n] for n in names])
+    scale = {n: 0.01 * abs(v) or 1e-3 for n, v in numbers.items()}
+    scale |= {offset_name(o): 0.01 * float(np.ptp(y)) or 1e-3 for o, y in recording.outputs.items()}
     u = np.column_stack([recording.signals[s] for s in signals])
     x = _as_given(recording, equations, states, u, values, held)
     typical = _typical(x, states)
@@ -86,10 +110,13 @@ def assembled(
         raise RecordingError(f"{where} the derivatives are not finite where the states start; check 'start' of each")
     about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
     places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
-    places = (*places, *_parameters(recording, states, signals, names, free))
+    places = (*places, *_parameters(recording, states, signals, names, [i for i in free if names[i] not in offsets]))
+    units_of = {**own_units, **{offset_name(o): recording.unit[o] for o in recording.outputs}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
-        return {k: found.get(k, v) for k, v in table.items()}
+        moved = {o: found.get(n, offsets[n]) for o in recording.outputs for n in (offset_name(o),)}
+        beside = {"offsets": {o: v for o, v in moved.items() if v}} if any(moved.values()) else {}
+        return {**{k: found.get(k, v) for k, v in table.items() if k != "offsets"}, **beside}
 
     integrates = bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN)
     return OdeTwin(
@@ -98,18 +125,16 @@ def assembled(
         outputs=tuple(recording.outputs),
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
-        parameters=tuple(
-            Parameter(names[i], str(own_units.get(names[i], "")), scale=0.01 * abs(values[i]) or 1e-3) for i in free
-        ),
+        parameters=tuple(Parameter(names[i], str(units_of.get(names[i], "")), scale=scale[names[i]]) for i in free),
         equations=equations,
         state_list=states,
         signals=signals,
-        names=tuple(names),
+        names=names,
         free=free,
-        given=dict(table),
+        given=numbers,
         holds=holds,
         text_of=text_of,
-        parameter_units=dict(own_units),
+        parameter_units=units_of,
         typical=typical,
         middle=middle,
         places=places,
@@ -251,13 +276,14 @@ def _states(where: str, table: object) -> tuple[State, ...]:
 
 def _programs(
     recording: Recording,
-    table: Mapping[str, Any],
     states: tuple[State, ...],
     signals: tuple[str, ...],
     names: tuple[str, ...],
-    every: tuple[str, ...],
+    offsets: Mapping[str, float],
 ) -> Programs:
     """Build equations from text, or by tracing the named Python function. Raises EquationError."""
+    table = recording.twin.parameters
+    every = ("t", *(s.name for s in states), *signals, *names, *offsets)
     texts, function = table.get("equations"), table.get("function")
     if (texts is None) == (function is None):
         raise EquationError("needs either equations, or function = 'file.py:name'")
@@ -288,8 +314,8 @@ def _programs(
     for o in recording.outputs:
         if o not in outputs and o not in own:
             raise EquationError(f"output '{o}' is no state; say under outputs how it is read, such as {o} = '{own[0]}'")
-    read = parse(reader, {**beside, **{f"output {o}": e for o, e in outputs.items()}},
-                 [f"output {o}" if o in outputs else o for o in recording.outputs])  # fmt: skip
+    readings = {f"output {o}": f"({outputs.get(o, o)}) + {n}" for o, n in zip(recording.outputs, offsets, strict=True)}
+    read = parse(reader, {**beside, **readings}, list(readings))
     return Programs(builder.program(results), reader.program(read), 1 + len(own) + len(signals))
 
 

@@ -188,10 +188,11 @@ def markdown(
     seeds: Sequence[int] = (),
 ) -> str:
     """The page ``docs/results/hands.json``."""
+    people_option = f" --people {len(seeds)}" if seeds else ""
     lines = [
         "# First results: the closed loop in real hands",
         "",
-        f"Made by `micron hands`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"Made by `micron hands{people_option}`, firmware revision {revision}; {seconds:g} s of virtual",
         f"time each, scored from {SETTLE_S:g} s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the",
         "physical truth, manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p",
         "in 8-12 Hz over the whole part that was chosen; the emulated instrument has all its sensor and actuator",
