@@ -27,9 +27,14 @@ from tools.mismatch.twins.ode import inside_of, weight_scale
 
 START_PASSES = 8
 """Most passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
+DESIGN_PASSES = 3
+"""The same for columns, whose weights are solved again at the run that they give, and where a pass is a run."""
+MOST_CURVES = 12
+"""Most weights behind an output whose columns are part of its start states. Those of a loop of twenty elements cost ten
+times as much as its fit."""
 SETTLED = 0.01
 """Change of an output by a pass, as a share of the noise of its record, below which no other is made."""
-LEAST_CHANGE = 1e-6
+LEAST_CHANGE = 1e-5
 """The same as a share of its range."""
 
 
@@ -360,7 +365,8 @@ class Model:
                 now = self._with_beside(before, how.theta, outputs)
                 return self.twin.respond(now, inputs, how.theta, forces, how.join), now
 
-            return settle((outputs, run), carried, how.theta, grows=False)
+            most = START_PASSES if how.join else DESIGN_PASSES
+            return settle((outputs, run), carried, how.theta, most, grows=False)
         before = len(run.starts) > 1 or not all(p.is_linear for p in paths.values())
         if paths and before and (inside is not None or forces):
             run = replace(run, about={o: outputs[o].value for o in paths}, memo=_without_runs(run))
@@ -375,7 +381,7 @@ class Model:
             now = before_effects(recorded, self._behind(before, inputs, outputs, how)[1])
             return self.twin.respond(now, inputs, how.theta, forces, how.join), now
 
-        return settle((outputs, run), read, how.theta, grows=True)
+        return settle((outputs, run), read, how.theta, DESIGN_PASSES, grows=True)
 
     def _behind(
         self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], how: Pass
@@ -420,11 +426,12 @@ class Model:
         return any(self._curves(o) for o in self.twin.outputs)
 
     def _curves(self, output: str) -> bool:
-        """Return True if an output passes through driven effects, and all of these have weights."""
+        """Return True if an output passes through driven effects, and all of these have weights, of which few."""
         if not isinstance(self.twin, DynamicTwin | CascadeTwin):
             return False
-        driven = [p.effect for p in self.placed if p.site == "output" and output in p.outputs and p.effect.driven]
-        return bool(driven) and all(e.kind == "add" for e in driven)
+        driven = [p for p in self.placed if p.site == "output" and output in p.outputs and p.effect.driven]
+        few = sum(len(p.parts.weights) for p in driven) <= MOST_CURVES
+        return bool(driven) and few and all(p.effect.kind == "add" for p in driven)
 
     def _with_beside(self, run: Run, theta: Array, outputs: Mapping[str, Signal]) -> Run:
         """Return the run of a linear twin with the columns of what is added behind each output.
@@ -579,8 +586,10 @@ class Model:
 Started = tuple[dict[str, Signal], Run]
 
 
-def settle(first: Started, again: Callable[[dict[str, Signal], Run], Started], theta: Array, *, grows: bool) -> Started:
-    """Return the outputs and the run of the last pass of ``again`` at ``theta``.
+def settle(
+    first: Started, again: Callable[[dict[str, Signal], Run], Started], theta: Array, most: int, *, grows: bool
+) -> Started:
+    """Return the outputs and the run of the last pass of ``again`` at ``theta``, of at most ``most``.
 
     Unless the change by a pass may grow (``grows``), that pass is not used: the start state is hardly seen behind its
     effects, and passes lead away from it.
@@ -588,7 +597,7 @@ def settle(first: Started, again: Callable[[dict[str, Signal], Run], Started], t
     last, was = first, np.inf
     measured = first[1].scale
     least = {o: max(SETTLED * roughness(measured[o], first[1].lasting, o), LEAST_CHANGE) for o in first[0]}
-    for _ in range(START_PASSES):
+    for _ in range(most):
         outputs, run = again(*last)
         pairs = {o: (fold(last[0][o], theta).value, fold(s, theta).value) for o, s in outputs.items()}
         shares = {o: float(np.max(np.abs(b - a)) / max(np.ptp(b), 1e-300)) for o, (a, b) in pairs.items()}

@@ -28,7 +28,7 @@ Symp., 1956)."""
 EVIDENCE = 8
 """Number of fixed-point steps to the prior variance of the weights."""
 
-AGAIN = 8
+AGAIN = 3
 """Most times that weights whose columns follow the run are solved again at the run that they give."""
 ALIKE = 1e-3
 """Change of the residual, as a share of it, below which they are not."""
