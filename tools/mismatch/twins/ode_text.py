@@ -321,8 +321,8 @@ def _programs(
     readings = {f"output {o}": f"({outputs.get(o, o)}) + {offset_name(o)}" for o in recording.outputs}
     read = parse(reader, {**beside, **readings}, list(readings))
     pairs = [(every.index(s), every.index(offset_name(s))) for s in recording.inputs]
-    programs = (shifted(p, pairs) for p in (builder.program(results), reader.program(read)))
-    return Programs(*programs, 1 + len(own) + len(signals))
+    rates = shifted(builder.program(results), pairs)
+    return Programs(rates, shifted(reader.program(read), pairs), 1 + len(own) + len(signals))
 
 
 def shifted(program: Program, pairs: Sequence[tuple[int, int]]) -> Program:
