@@ -56,7 +56,10 @@ LONGEST_LINGER_NS = 60_000_000_000
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
 SOON_NS = 100_000
 """Longest time that taking a request or ending a transfer keeps the process from what is due next."""
-PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
+PRIORITY = 75
+"""Below the loop's, so that the emulation never preempts what it is there to test, and above that of the kernel's
+threads for ttys (``firmware_py.machine.workers``): one that this process wakes with a scan would take its processor and
+drive it to the one on which the loop is about to wake."""
 PR_SET_PDEATHSIG = 1
 LONGEST_STEP_S = 60.0
 """Longest step of a paused clock: clients and the next order wait until it is computed."""

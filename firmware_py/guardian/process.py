@@ -25,14 +25,17 @@ from drivers.registry import find_driver
 from firmware_py.guardian.care import start_failed
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Why
-from firmware_py.guardian.mark import DeathMark
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from hal.backends import open_i2c
 from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
+from hal.contracts import Clock
 from hal.errors import HalError, OpenFailed
 
 PRIORITY = 85  # above the loop: it does almost nothing, but must do it while the loop is stuck
+LOOK_NS = 200_000
+"""The guardian looks so long after a command began: the loop then waits for its bus, and nobody computes. A step at
+another time takes the processor from the loop or from what it waits for."""
 START_S = 30.0
 END_S = 5.0
 """Time that the guardian may take to end beyond its retries."""
@@ -145,16 +148,24 @@ class GuardianProcess:
         return None
 
 
-def serve(guardian: Guardian, pipe: int, mark: DeathMark) -> None:
+def pause_ns(beat_ns: int, now_ns: int) -> int:
+    """Return the time to the next step: a millisecond, or up to half of one less, so that the steps come ``LOOK_NS``
+    after a command began."""
+    late_ns = (now_ns - beat_ns - LOOK_NS + STEP_NS // 2) % STEP_NS - STEP_NS // 2
+    return STEP_NS - max(0, late_ns)
+
+
+def serve(guardian: Guardian, heart: Heart, clock: Clock, pipe: int) -> None:
     """Step ``guardian`` until the outputs need none any more.
 
-    The firmware is dead when ``mark`` says so or ``pipe`` has no writer any more, whichever comes first.
+    The firmware is dead when the mark of ``heart`` says so or ``pipe`` has no writer any more, whichever comes first.
     """
     open_pipe = [pipe]
     while guardian.state is not State.DONE:
-        if select.select(open_pipe, (), (), STEP_NS * 1e-9)[0] and not os.read(pipe, 64):
+        pause_s = pause_ns(heart.beat_ns, clock.now_ns()) * 1e-9
+        if select.select(open_pipe, (), (), pause_s)[0] and not os.read(pipe, 64):
             open_pipe = []
-        guardian.step(alive=bool(open_pipe) and not mark.owner_died)
+        guardian.step(alive=bool(open_pipe) and not heart.mark.owner_died)
 
 
 def main(arguments: list[str]) -> int:
@@ -186,7 +197,7 @@ def main(arguments: list[str]) -> int:
         # long on a busy machine
         sys.stdout.write("ready\n")
         sys.stdout.flush()
-        serve(guardian, order["pipe"], heart.mark)
+        serve(guardian, heart, clock, order["pipe"])
     report = guardian.report()
     partial = Path(order["report"] + ".partial")
     with suppress(OSError):  # whoever wanted it may have cleaned up

@@ -100,7 +100,7 @@ def test_the_guardian_answers_to_the_mark_although_the_pipe_stays_open(owner: Ow
     owner.heart.beat(clock.now_ns())
     never_closed, writer = os.pipe()
     owner.kill()
-    serve(guardian, never_closed, owner.heart.mark)
+    serve(guardian, owner.heart, clock, never_closed)
     assert (guardian.state, owner.heart.why) == (State.DONE, Why.DIED)
     assert [round(20.0 * volts, 2) for volts in dac.output_V[:3]] == [50.0] * 3
     for descriptor in (never_closed, writer):
