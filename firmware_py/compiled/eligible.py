@@ -33,9 +33,10 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
         bus = bench.description.bus.get(spec.bus or "")
         if driver.role in IN_TICK and isinstance(bus, CanSpec) and not _has_frame_socket(bus.uri):
             reasons.append(f"device.{name}: its bus {bus.uri} has no socket of single frames; socketcan:// has")
-    n_axes = sum(len(o.channels) for o in options.values() if isinstance(o, Adxl203Options))
-    if n_axes > AXES:
-        reasons.append(f"{n_axes} accelerometer axes: what tells which of more than {AXES} is wrong is Python")
+    axes = {f"device.{name}": len(o.channels) for name, o in options.items() if isinstance(o, Adxl203Options)}
+    if (n_axes := sum(axes.values())) > AXES:
+        why = f"{n_axes} accelerometer axes; what tells which of more than {AXES} is wrong is Python"
+        reasons.append(f"{', '.join(axes)}: {why}")
     if pace != "realtime":
         reasons.append("emulated time passes in Python (--realtime runs on the wall clock)")
     if injected:

@@ -6,6 +6,8 @@ on time. A run that the host held up is repeated by nobody: it is skipped, and s
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 from firmware_py.app import run_in_process
+from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.run.findings import CauseClass
 from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
@@ -107,3 +110,37 @@ def test_a_fault_of_the_dac_or_its_stacks_ends_the_run(tmp_path: Path, fault: Fa
 @pytest.mark.parametrize(("bench", "fault"), OF_OTHER_OUTPUTS, ids=[fault.name for _, fault in OF_OTHER_OUTPUTS])
 def test_a_fault_of_another_output_ends_the_run(tmp_path: Path, bench: str, fault: Fault):
     check(*run_with(tmp_path, bench, fault), fault)
+
+
+def test_a_full_ring_of_the_recorder_loses_rows_and_the_loop_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The recorder's process stands still for the whole run. In virtual time the outputs are those of a run without a
+    recorder, bit for bit (``tests/unit/compiled/test_full_queues.py``)."""
+    start, stop = RecorderProcess.start, RecorderProcess.stop
+    recorders: list[int] = []
+
+    def start_and_halt(*arguments: Any, **keywords: Any) -> RecorderProcess:
+        recorder = start(*arguments, **keywords, capacity_rows=64)
+        recorders.append(recorder.pid)
+        os.kill(recorder.pid, signal.SIGSTOP)
+        return recorder
+
+    def wake_and_stop(recorder: RecorderProcess, *arguments: Any) -> Any:
+        os.kill(recorder.pid, signal.SIGCONT)
+        return stop(recorder, *arguments)
+
+    monkeypatch.setattr(RecorderProcess, "start", start_and_halt)
+    monkeypatch.setattr(RecorderProcess, "stop", wake_and_stop)
+    file = write_bench(BENCHES / "micron-e727.toml", POINTS[1], tmp_path)
+    file.write_text(with_keys(file.read_text(), "firmware.safety", "holds_per_minute = 60\n"))
+    record = tmp_path / "run.mcap"
+    request = RunRequest(file, 2.0, pace="realtime", stale_ms=300.0, compiled=True, record=record)
+    outcome, truth = run_in_process(request)
+    assert recorders
+    assert outcome["safe_state"]["normal"], outcome["safe_state"]
+    assert {hold["class"] for hold in outcome["holds"]} <= {CauseClass.HOST}
+    assert outcome["loop"]["ticks"] > 500
+    kept, dropped = outcome["recorder"]["ticks"], outcome["recorder"]["dropped"]
+    assert dropped > 500
+    assert kept + dropped == outcome["samples"]["received"]
+    assert truth is not None
+    np.testing.assert_allclose(truth["amplifier_V"][-1], NEUTRAL_V, atol=CLOSE_V)

@@ -25,6 +25,10 @@ NEUTRAL_V = 50.0
 RAMP_MS = 16.0
 SAMPLE_MS = 1.0
 """Between two rows of the devices' record."""
+LEASE_MS = 601
+"""Silence after which the guardian of ``Run`` takes the outputs (twice ``stale_ms``, and a margin)."""
+TAKING_MS = 1500
+"""Time for the guardian's ramp of 16 ms on a machine that is busy with much else."""
 RATIO = 3.0
 """How many times the answer of a bare pipe the guardian may take before its ramp begins."""
 
@@ -197,6 +201,37 @@ def test_a_firmware_that_stands_still_is_taken_over_and_holds_when_it_wakes(run:
     assert "no command for a while (guardian)" in outcome["noticed"]
 
 
+@pytest.mark.parametrize("is_compiled", [True])
+@pytest.mark.parametrize("longest_ms", [3000, pytest.param(300, marks=pytest.mark.slow)])
+def test_stops_of_a_millisecond_to_seconds_are_the_hosts_and_one_that_outlasts_the_lease_is_spent_at_neutral(
+    run: Run, longest_ms: int
+) -> None:
+    run.wait_until_moving(0.1)
+    stops: list[tuple[int, int]] = []
+    for ms in (1, 5, 20, longest_ms):
+        began_ns = time.monotonic_ns()
+        os.kill(run.process.pid, signal.SIGSTOP)
+        time.sleep(ms * 1e-3)
+        stops.append((began_ns, time.monotonic_ns()))
+        os.kill(run.process.pid, signal.SIGCONT)
+        time.sleep(0.2)
+    run.process.send_signal(signal.SIGINT)
+    outcome = run.outcome()
+    assert outcome["loop"]["ticks"] > 0
+    assert outcome["safe_state"]["reached"], outcome["safe_state"]
+    assert {hold["class"] for hold in outcome["holds"]} <= {"host"}, outcome["holds"]
+    with np.load(run.folder / "truth.npz", allow_pickle=False) as truth:
+        t_ns, volts = truth["t_ns"], truth["amplifier_V"]
+    away = np.abs(volts - NEUTRAL_V).max(axis=1) > 0.01
+    assert away[t_ns < stops[0][0]].any()  # something was moving
+    assert not away[-1]
+    if longest_ms > LEASE_MS + TAKING_MS:
+        began_ns, ended_ns = stops[-1]
+        within = (t_ns > began_ns + (LEASE_MS + TAKING_MS) * 1_000_000) & (t_ns < ended_ns)
+        assert within.sum() > 100
+        assert not away[within].any()
+
+
 def children_of(pid: int, module: bytes) -> list[int]:
     children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     return [child for child in children if module in Path(f"/proc/{child}/cmdline").read_bytes()]
@@ -243,6 +278,7 @@ def test_the_result_tells_of_the_lost_guardian(run: Run, tmp_path: Path) -> None
     assert outcome["safe_state"]["reached"]
 
 
+@pytest.mark.parametrize("is_compiled", LOOPS)
 def test_a_bus_that_hangs_for_more_than_half_a_second_is_opened_anew_and_brought_to_neutral(run: Run) -> None:
     """All devices stand still, then go on. Who of the two brings the outputs to neutral, and that neither is ended for
     it, is tested in virtual time (``test_hanging_bus.py``): here the world makes up for lost time on a busy machine."""
@@ -277,6 +313,7 @@ def test_a_world_that_is_killed_before_an_interrupt_leaves_an_outcome_that_says_
     assert "switch the amplifier off" in safe["reason"]
 
 
+@pytest.mark.parametrize("is_compiled", LOOPS)
 def test_a_firmware_that_dies_while_its_bus_hangs_leaves_a_guardian_and_a_world_until_both_are_done(run: Run) -> None:
     run.wait_until_moving(0.1)
     world = run.world()

@@ -46,8 +46,16 @@ def test_closed_loop_over_real_ports_cancels_tremor_or_names_the_host(tmp_path: 
         assert result["tremor"]["reduction_percent"] > 50.0
 
 
-@pytest.mark.parametrize("blow", ["unplug", "kill"])
-def test_losing_the_link_in_real_time_ends_safe_and_names_it(tmp_path: Path, blow: str):
+@pytest.mark.parametrize(
+    ("blow", "compiled"),
+    [
+        ("unplug", False),
+        ("kill", False),
+        ("unplug", True),
+        pytest.param("kill", True, marks=pytest.mark.slow),
+    ],
+)
+def test_losing_the_link_in_real_time_ends_safe_and_names_it(tmp_path: Path, blow: str, compiled: bool):
     # whatever the machine does meanwhile, the blow falls into a run that still goes on
     bench = copy_of_default_bench(tmp_path, "\n[firmware.safety]\nholds_per_minute = 60\n")
     timers: list[threading.Timer] = []
@@ -61,7 +69,8 @@ def test_losing_the_link_in_real_time_ends_safe_and_names_it(tmp_path: Path, blo
         if status.get("state") == "running" and not timers[0].is_alive() and not timers[0].finished.is_set():
             timers[0].start()
 
-    outcome, truth = run_in_process(RunRequest(bench, 30.0, pace="realtime"), start_when_running, on_open=prepare)
+    request = RunRequest(bench, 30.0, pace="realtime", compiled=compiled)
+    outcome, truth = run_in_process(request, start_when_running, on_open=prepare)
     timers[0].join()
     safe = outcome["safe_state"]
     assert not safe["normal"]

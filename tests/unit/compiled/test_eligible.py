@@ -28,7 +28,7 @@ def test_these_benches_can(bench: str):
 @pytest.mark.parametrize(
     ("bench", "what"),
     [
-        ("micron-eight", "8 accelerometer axes"),
+        ("micron-eight", "device.acc1, device.acc2, device.acc3, device.acc4: 8 accelerometer axes"),
         ("endoscope", "an endoscope's loop is Python"),
     ],
 )
@@ -57,11 +57,40 @@ def test_emulated_time_and_injected_faults_are_python():
         check_compiled(load_bench(BENCHES / "micron-e727.toml"), "paced", injected=True)
 
 
-def test_asked_for_it_is_bad_input(tmp_path: Path):
+def bench_of_ni(folder: Path) -> Path:
+    """Return the default bench with a National Instruments card in place of DAQ and amplifier."""
+    text = (BENCHES / "micron.toml").read_text()
+    text = text.replace('driver = "di4108"\nbus = "daq0"', 'driver = "nidaqmx"\ndevice = "Dev1"')
+    text = text.replace(
+        'driver = "dac_amplifier"\nbus = "i2c0"\naddress = 0x0C', 'driver = "nidaqmx_ao"\ndevice = "Dev1"'
+    )
+    file = folder / "ni.toml"
+    file.write_text(text)
+    return file
+
+
+def test_each_device_without_kernels_is_named(tmp_path: Path):
+    assert reasons_against_bench(load_bench(bench_of_ni(tmp_path)), "realtime") == [
+        "device.daq: its driver nidaqmx has no kernels on bytes",
+        "device.piezo: its driver nidaqmx_ao has no kernels on bytes",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("bench", "what"),
+    [
+        ("micron-eight", "device.acc1, device.acc2, device.acc3, device.acc4: 8 accelerometer axes"),
+        ("endoscope", "an endoscope's loop is Python"),
+        ("imus", "an endoscope's loop is Python"),
+        ("NI", "device.daq: its driver nidaqmx has no kernels on bytes; device.piezo: its driver nidaqmx_ao has no"),
+    ],
+)
+def test_asked_for_it_is_bad_input(tmp_path: Path, bench: str, what: str):
     record = tmp_path / "run.mcap"
-    bench = str(BENCHES / "micron-eight.toml")
-    result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", "--compiled", "--record", str(record)])
+    file = str(bench_of_ni(tmp_path) if bench == "NI" else BENCHES / f"{bench}.toml")
+    result = CliRunner().invoke(app, ["run", "--bench", file, "--realtime", "--compiled", "--record", str(record)])
     assert result.exit_code == 2
+    assert what in " ".join(result.output.split())
     assert not record.exists()
 
 
