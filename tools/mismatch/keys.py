@@ -146,8 +146,7 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key(
                 "offsets",
                 "table of numbers",
-                "what an output shows at zero, or what is added to an input; re-fitted, unless fixed lists"
-                " <signal>_offset",
+                "what each output shows at zero; re-fitted, unless fixed lists <output>_offset",
                 "0",
             ),
             Key(

@@ -136,7 +136,7 @@ def test_the_equations_of_the_page_are_a_twin(tmp_path: Path) -> None:
     )
     found = load(tmp_path)
     assert found.unit["speed"] == "rad/s"
-    assert [p.name for p in make(found).parameters] == ["torque_per_A", "bearing", "speed_offset", "current_offset"]
+    assert [p.name for p in make(found).parameters] == ["torque_per_A", "bearing", "speed_offset"]
 
 
 def test_a_key_that_nobody_described_is_listed() -> None:

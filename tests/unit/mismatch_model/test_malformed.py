@@ -114,7 +114,7 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "B of wrong shape": (space("A = [[-1.0]]\nB = [[1.0, 2.0]]\nC = [[1.0]]"), None, "expected 1 x 1"),
     "A with a hole": (space("A = [[-1.0, nan], [0.0, -2.0]]"), None, "A: row 1, column 2 is nan"),
     "x0 of wrong size": (space("A = [[-1.0]]\nB = [[1.0]]\nC = [[1.0]]\nx0 = [1.0, 2.0]"), None, "expected 1 x 1"),
-    "unknown symbol": (equation("(u - kk * z) / lag"), None, "'kk' is no state, .*; known: t, z, u, lag, z_off"),
+    "unknown symbol": (equation("(u - kk * z) / lag"), None, "'kk' is no state, .*; known: t, z, u, lag, z_offset$"),
     "open bracket": (equation("(u - z / lag"), None, r"'\(u - z / lag' cannot be read \('\(' was never closed\)$"),
     "infinite at once": (equation("u / (lag - lag)"), None, "state 'z' is .* with your own parameters"),
     "unknown hold": (space('A = [[-1.0]]\nB = [[1.0]]\nC = [[1.0]]\nhold = "first"'), None, "hold must be"),

@@ -95,7 +95,7 @@ k = 30.0
             a, b = model.slices(0)
             theta[a], theta[b] = searched, weights
             moved.append(model.simulate(View.whole(recording), theta)["position"])
-        plain = Model(make(one)).simulate(View.whole(one), np.array([0.4, 30.0, 0.0, 0.0]))
+        plain = Model(make(one)).simulate(View.whole(one), np.array([0.4, 30.0, 0.0]))
         assert np.std(moved[0] - plain["position"]) > 0.1 * np.std(moved[0]), name
         assert np.std(moved[0] - moved[1]) < 0.02 * np.std(moved[0]), name
 

@@ -84,7 +84,7 @@ def test_a_function_beside_the_recording_is_a_twin(tmp_path: Path) -> None:
     u = command()
     one = recorded(tmp_path, text, u, 0.1 * u[::-1])
     other = recorded(tmp_path / "text", MOTOR, u, 0.1 * u[::-1])
-    a, b = (Model(make(r)).simulate(View.whole(r), np.array([20.0, 0.08, 0.0, 0.0]))["angle"] for r in (one, other))
+    a, b = (Model(make(r)).simulate(View.whole(r), np.array([20.0, 0.08, 0.0]))["angle"] for r in (one, other))
     assert np.array_equal(a, b)
 
 
@@ -161,32 +161,30 @@ def test_a_parameter_may_follow_a_recorded_signal(tmp_path: Path) -> None:
         twin = make(recording)
         places = [p.target for p in sites(twin, recording, EFFECTS["parameter_variation"])]
         assert places == ["gain by temperature", "tau by temperature"]
-        found.append(Model(twin).simulate(View.whole(recording), np.array([20.0, 0.08, 0.0, 0.0]))["angle"])
+        found.append(Model(twin).simulate(View.whole(recording), np.array([20.0, 0.08, 0.0]))["angle"])
         if law == "tau":
             place = sites(twin, recording, EFFECTS["parameter_variation"])[1]
             pairs = twin.place(place.target).pairs  # type: ignore[attr-defined]
             model = Model(twin, [replace(place, settings={"centre": (25.0,), "spread": (5.0,), "pairs": pairs})])
-            found.append(model.simulate(View.whole(recording), np.array([20.0, 0.08, 0.0, 0.0, 0.05]))["angle"])
+            found.append(model.simulate(View.whole(recording), np.array([20.0, 0.08, 0.0, 0.05]))["angle"])
     plain, by_effect, written = found
     assert np.allclose(by_effect, written, rtol=0, atol=1e-12)
     assert np.std(plain - written) > 0.01
 
 
 def test_the_zero_of_a_sensor_is_a_parameter_and_written(tmp_path: Path) -> None:
-    """Offsets of an output and an input act as in closed form, go into the corrected twin and come back."""
+    """An offset is re-fitted as the closed form has it, goes into the corrected twin and comes back."""
     u = command()
     recording = recorded(tmp_path, MOTOR, u, 0.1 * u[::-1])
     twin = make(recording)
-    assert [p.name for p in twin.parameters] == ["gain", "tau", "angle_offset", "command_offset"]
-    theta = np.array([20.0, 0.08, 0.7, 0.3])
-    pushed = replace(recording, inputs={"command": recording.inputs["command"] + 0.3})
-    plain = Model(make(pushed)).simulate(View.whole(pushed), theta * [1, 1, 0, 0])["angle"]
-    moved = Model(twin).simulate(View.whole(recording), theta)["angle"]
+    assert [p.name for p in twin.parameters] == ["gain", "tau", "angle_offset"]
+    theta = np.array([20.0, 0.08, 0.7])
+    plain, moved = (Model(twin).simulate(View.whole(recording), t)["angle"] for t in (theta * [1, 1, 0], theta))
     np.testing.assert_allclose(moved - plain, 0.7, rtol=0, atol=1e-12)
     text = twin.to_text(theta)
-    assert text["offsets"] == {"angle": 0.7, "command": 0.3}
+    assert text["offsets"] == {"angle": 0.7}
     again = make(replace(recording, twin=replace(recording.twin, parameters=text)))
     np.testing.assert_array_equal(again.start(recording), theta)
     wrong = replace(recording, twin=replace(recording.twin, parameters={**text, "offsets": {"speed": 1.0}}))
-    with pytest.raises(RecordingError, match="offsets must give a number for one of angle, command, got"):
+    with pytest.raises(RecordingError, match=r"offsets must give a number for an output \(angle\), got"):
         make(wrong)

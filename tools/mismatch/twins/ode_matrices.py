@@ -58,8 +58,7 @@ def physical_twin(recording: Recording, m: Matrices) -> OdeTwin:
         at[offset_name(o)] = ("y0", k, 0)
         readings[o] = " + ".join(parts) or "0"
     text = {**numbers, "states": states, "equations": equations, "outputs": readings, "hold": holds_text(m.holds)}
-    # matrices have no place for the offset of an input
-    text |= {"offsets": dict(zip(outputs, m.y0.tolist(), strict=True)), "fixed": [offset_name(s) for s in inputs]}
+    text["offsets"] = dict(zip(outputs, m.y0.tolist(), strict=True))
     given = recording.twin.parameters
     twin = ode_twin(replace(recording, twin=replace(recording.twin, parameters=text)))
 

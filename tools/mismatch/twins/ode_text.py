@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
 from tools.errors import RecordingError
-from tools.guest.equations import ADD, Builder, EquationError, Program, builder_of
+from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
@@ -57,20 +57,21 @@ def ode_twin(recording: Recording) -> OdeTwin:
 
 
 def _offsets(where: str, recording: Recording, table: Mapping[str, Any]) -> dict[str, float]:
-    """Return the offset of every output and input, under the name that it has as a parameter.
+    """Return the offset of every output, under the name that it has as a parameter.
 
-    The zero of a sensor or an amplifier is no physics that is missing: without it a constant would be named as a step,
-    a curve or a loop.
+    A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve.
     """
-    given, every = table.get("offsets", {}), (*recording.outputs, *recording.inputs)
-    if not isinstance(given, Mapping) or any(s not in every or not _number(v) for s, v in given.items()):
-        raise RecordingError(f"{where} offsets must give a number for one of {', '.join(every)}, got {given!r}")
-    return {offset_name(s): float(given.get(s, 0.0)) for s in every}
+    given = table.get("offsets", {})
+    if not isinstance(given, Mapping) or any(o not in recording.outputs or not _number(v) for o, v in given.items()):
+        raise RecordingError(
+            f"{where} offsets must give a number for an output ({', '.join(recording.outputs)}), got {given!r}"
+        )
+    return {offset_name(o): float(given.get(o, 0.0)) for o in recording.outputs}
 
 
-def offset_name(signal: str) -> str:
-    """Return the name of the offset of an output or input among the parameters."""
-    return f"{signal}_offset"
+def offset_name(output: str) -> str:
+    """Return the name of the offset of an output among the parameters."""
+    return f"{output}_offset"
 
 
 def _assembled(
@@ -93,11 +94,11 @@ def _assembled(
     own_units = table.get("units", {})
     if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
         raise RecordingError(f"{where} units must give the unit of each parameter as text")
+    free = tuple(i for i, n in enumerate(names) if n not in fixed)
     values = np.array([numbers[n] for n in names])
     scale = {n: 0.01 * abs(v) or 1e-3 for n, v in numbers.items()}
-    # small beside those of the engineer's own numbers: a constant that these make as well is left to them
-    for share, signals_of in ((1e-4, recording.outputs), (3e-5, recording.inputs)):
-        scale |= {offset_name(s): share * float(np.ptp(x)) or 1e-3 for s, x in signals_of.items()}
+    # small beside those of the engineer's own numbers: a constant that one of these makes as well is left to it
+    scale |= {offset_name(o): 1e-4 * float(np.ptp(y)) or 1e-3 for o, y in recording.outputs.items()}
     u = np.column_stack([recording.signals[s] for s in signals])
     x = _as_given(recording, equations, states, u, values, held)
     typical = _typical(x, states)
@@ -110,19 +111,15 @@ def _assembled(
         raise RecordingError(f"{where} the derivatives are not finite where the states start; check 'start' of each")
     about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
     places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
-    integrates = bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN)
-    # behind linear equations that settle, the zero of an input is one of a sensor
-    same = [] if integrates or not equations.affine else [offset_name(s) for s in recording.inputs]
-    free = tuple(i for i, n in enumerate(names) if n not in fixed and n not in same)
     places = (*places, *_parameters(recording, states, signals, names, [i for i in free if names[i] not in offsets]))
-    every = (*recording.outputs, *recording.inputs)
-    units_of = {**own_units, **{offset_name(s): recording.unit[s] for s in every}}
+    units_of = {**own_units, **{offset_name(o): recording.unit[o] for o in recording.outputs}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
-        moved = {s: found.get(offset_name(s), offsets[offset_name(s)]) for s in every}
-        beside = {"offsets": {s: v for s, v in moved.items() if v}} if any(moved.values()) else {}
+        moved = {o: found.get(n, offsets[n]) for o in recording.outputs for n in (offset_name(o),)}
+        beside = {"offsets": {o: v for o, v in moved.items() if v}} if any(moved.values()) else {}
         return {**{k: found.get(k, v) for k, v in table.items() if k != "offsets"}, **beside}
 
+    integrates = bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN)
     return OdeTwin(
         kind=recording.twin.kind,
         inputs=tuple(recording.inputs),
@@ -318,24 +315,9 @@ def _programs(
     for o in recording.outputs:
         if o not in outputs and o not in own:
             raise EquationError(f"output '{o}' is no state; say under outputs how it is read, such as {o} = '{own[0]}'")
-    readings = {f"output {o}": f"({outputs.get(o, o)}) + {offset_name(o)}" for o in recording.outputs}
+    readings = {f"output {o}": f"({outputs.get(o, o)}) + {n}" for o, n in zip(recording.outputs, offsets, strict=True)}
     read = parse(reader, {**beside, **readings}, list(readings))
-    pairs = [(every.index(s), every.index(offset_name(s))) for s in recording.inputs]
-    rates = shifted(builder.program(results), pairs)
-    return Programs(rates, shifted(reader.program(read), pairs), 1 + len(own) + len(signals))
-
-
-def shifted(program: Program, pairs: Sequence[tuple[int, int]]) -> Program:
-    """Return the program that uses the sum of two variables in place of the first, for each of ``pairs``."""
-    operations, registers, results = program
-    used = {*operations[:, 2:].ravel().tolist(), *results.tolist()}
-    pairs = [(a, b) for a, b in pairs if a in used]
-    n = registers.size
-    place = np.arange(n)
-    place[[a for a, _ in pairs]] = n + np.arange(len(pairs))
-    sums = np.array([(ADD, n + i, a, b, 0) for i, (a, b) in enumerate(pairs)], np.int64).reshape(-1, 5)
-    rest = np.column_stack([operations[:, :2], place[operations[:, 2:]]])
-    return Program(np.concatenate([sums, rest]), np.r_[registers, np.zeros(len(pairs))], place[results])
+    return Programs(builder.program(results), reader.program(read), 1 + len(own) + len(signals))
 
 
 def _texts(key: str, table: object) -> dict[str, str]:
