@@ -146,7 +146,7 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key(
                 "offsets",
                 "table of numbers",
-                "what each output shows at zero; re-fitted, unless fixed lists <output>_offset",
+                "what each output shows at zero; re-fitted, unless fixed lists OUTPUT_offset",
                 "0",
             ),
             Key(

@@ -188,3 +188,12 @@ def test_the_zero_of_a_sensor_is_a_parameter_and_written(tmp_path: Path) -> None
     wrong = replace(recording, twin=replace(recording.twin, parameters={**text, "offsets": {"speed": 1.0}}))
     with pytest.raises(RecordingError, match=r"offsets must give a number for an output \(angle\), got"):
         make(wrong)
+
+
+def test_a_parameter_that_has_the_name_of_an_offset_stays_the_engineers(tmp_path: Path) -> None:
+    u = command()
+    mine = MOTOR.replace("[twin.parameters]", "[twin.parameters]\nangle_offset = 0.3")
+    recording = recorded(tmp_path, mine, u, 0.1 * u[::-1])
+    twin = make(recording)
+    assert sorted(p.name for p in twin.parameters) == ["angle_offset", "gain", "tau"]
+    assert "offsets" not in twin.to_text(twin.start(recording))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +44,7 @@ def ode_twin(recording: Recording) -> OdeTwin:
     for name in (*(s.name for s in states), *signals, *names):
         if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name) or name in ("t", "pi"):
             raise RecordingError(f"{where} '{name}' cannot be used in an equation; give it another name")
-    offsets = _offsets(where, recording, table)
+    offsets = _offsets(where, recording, table, {*(s.name for s in states), *signals, *names})
     every = ("t", *(s.name for s in states), *signals, *names, *offsets)
     twice = {n for n in every if every.count(n) > 1}
     if twice:
@@ -56,17 +56,17 @@ def ode_twin(recording: Recording) -> OdeTwin:
     return _assembled(recording, equations, states, signals, names, offsets)
 
 
-def _offsets(where: str, recording: Recording, table: Mapping[str, Any]) -> dict[str, float]:
-    """Return the offset of every output, under the name that it has as a parameter.
+def _offsets(where: str, recording: Recording, table: Mapping[str, Any], others: Collection[str]) -> dict[str, float]:
+    """Return the offset of every output, under the name that it has as a parameter; none where one of ``others`` has it.
 
-    A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve.
+    A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve. An
+    engineer who has a parameter of that name has it in the equations.
     """
+    own = [o for o in recording.outputs if offset_name(o) not in others]
     given = table.get("offsets", {})
-    if not isinstance(given, Mapping) or any(o not in recording.outputs or not _number(v) for o, v in given.items()):
-        raise RecordingError(
-            f"{where} offsets must give a number for an output ({', '.join(recording.outputs)}), got {given!r}"
-        )
-    return {offset_name(o): float(given.get(o, 0.0)) for o in recording.outputs}
+    if not isinstance(given, Mapping) or any(o not in own or not _number(v) for o, v in given.items()):
+        raise RecordingError(f"{where} offsets must give a number for an output ({', '.join(own)}), got {given!r}")
+    return {offset_name(o): float(given.get(o, 0.0)) for o in own}
 
 
 def offset_name(output: str) -> str:
@@ -98,7 +98,8 @@ def _assembled(
     values = np.array([numbers[n] for n in names])
     scale = {n: 0.01 * abs(v) or 1e-3 for n, v in numbers.items()}
     # small beside those of the engineer's own numbers: a constant that one of these makes as well is left to it
-    scale |= {offset_name(o): 1e-4 * float(np.ptp(y)) or 1e-3 for o, y in recording.outputs.items()}
+    offset_of = {offset_name(o): o for o in recording.outputs if offset_name(o) in offsets}
+    scale |= {n: 1e-4 * float(np.ptp(recording.outputs[o])) or 1e-3 for n, o in offset_of.items()}
     u = np.column_stack([recording.signals[s] for s in signals])
     x = _as_given(recording, equations, states, u, values, held)
     typical = _typical(x, states)
@@ -112,10 +113,10 @@ def _assembled(
     about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
     places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
     places = (*places, *_parameters(recording, states, signals, names, [i for i in free if names[i] not in offsets]))
-    units_of = {**own_units, **{offset_name(o): recording.unit[o] for o in recording.outputs}}
+    units_of = {**own_units, **{n: recording.unit[o] for n, o in offset_of.items()}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
-        moved = {o: found.get(n, offsets[n]) for o in recording.outputs for n in (offset_name(o),)}
+        moved = {o: found.get(n, offsets[n]) for n, o in offset_of.items()}
         beside = {"offsets": {o: v for o, v in moved.items() if v}} if any(moved.values()) else {}
         return {**{k: found.get(k, v) for k, v in table.items() if k != "offsets"}, **beside}
 
@@ -315,7 +316,8 @@ def _programs(
     for o in recording.outputs:
         if o not in outputs and o not in own:
             raise EquationError(f"output '{o}' is no state; say under outputs how it is read, such as {o} = '{own[0]}'")
-    readings = {f"output {o}": f"({outputs.get(o, o)}) + {n}" for o, n in zip(recording.outputs, offsets, strict=True)}
+    added = {o: f" + {offset_name(o)}" if offset_name(o) in offsets else "" for o in recording.outputs}
+    readings = {f"output {o}": f"({outputs.get(o, o)}){zero}" for o, zero in added.items()}
     read = parse(reader, {**beside, **readings}, list(readings))
     return Programs(builder.program(results), reader.program(read), 1 + len(own) + len(signals))
 
