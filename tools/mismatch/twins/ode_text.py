@@ -57,7 +57,7 @@ def ode_twin(recording: Recording) -> OdeTwin:
 
 
 def _offsets(where: str, recording: Recording, table: Mapping[str, Any], others: Collection[str]) -> dict[str, float]:
-    """Return the offset of every output, under the name that it has as a parameter; none where one of ``others`` has it.
+    """Return the offset of every output, by its name as a parameter; none where one of ``others`` has it.
 
     A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve. An
     engineer who has a parameter of that name has it in the equations.
