@@ -20,6 +20,7 @@ DRIVERS = "micron.drivers"
 DEVICES = "micron.devices"
 ESTIMATORS = "micron.estimators"
 FUSION = "micron.fusion"
+ATTITUDE = "micron.attitude"
 EFFECTS = "micron.effects"
 TWINS = "micron.twins"
 

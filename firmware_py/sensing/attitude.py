@@ -1,54 +1,81 @@
 """Attitude without gyroscopes: angular acceleration integrated twice, held by gravity and the magnetic field.
 
-The instrument at rest is aligned by TRIAD; then one of ``FILTERS`` follows, which the records are made for.
+The instrument at rest is aligned by TRIAD; then ``error-state`` follows, or a filter that a package offers in the group
+``micron.attitude`` (``AttitudeFilter``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from firmware_py.records import Array, Records, new
-from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion
-from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnNumbers
+from firmware_py.sensing.config import DEFAULT_METHOD, SensingConfig
 from firmware_py.sensing.error_state import ERROR_STATE_FILTER
-from firmware_py.sensing.observer import OBSERVER
 from firmware_py.sensing.quaternion import from_matrix, to_matrix
-from firmware_py.sensing.quaternion_kalman import QUATERNION_KALMAN_FILTER
 from firmware_py.sensing.triad import triad
 from hal.compiled import inlined_kernel, kernel
-from hal.kernel_calls import ChosenKernel
-
-FILTERS: Mapping[str, AttitudeFilter] = {
-    "observer": OBSERVER,
-    "error_state": ERROR_STATE_FILTER,
-    "quaternion_kalman": QUATERNION_KALMAN_FILTER,
-}
-"""Filters by the name of their records."""
-_begin = ChosenKernel(FILTERS, "begin")
-_step = ChosenKernel(FILTERS, "step")
+from hal.errors import BenchError
+from hal.kernel_calls import ChosenKernel, call_entry, entry
+from hal.plugins import ATTITUDE, load
 
 
-def chosen_filter(config: SensingConfig) -> str:
-    """Return the name of the configured filter's records."""
-    return config.attitude_method.replace("-", "_")
+@kernel
+def _begin_own(north: Array, state: AttitudeState, params: OwnNumbers) -> None:
+    call_entry(params.own.begin, north, state, params)
+
+
+@kernel
+def _step_own(motion: Motion, state: AttitudeState, params: OwnNumbers) -> None:
+    call_entry(params.own.step, motion, state, params)
+
+
+class _Own(NamedTuple):
+    """The kernels of a package's filter, called by address: it compiles itself, and nothing of ours."""
+
+    begin: Any = _begin_own
+    step: Any = _step_own
+
+
+_KERNELS = {"error_state": ERROR_STATE_FILTER, "own": _Own()}
+"""Kernels by the name of the filter's own records."""
+_begin = ChosenKernel(_KERNELS, "begin")
+_step = ChosenKernel(_KERNELS, "step")
+
+
+def _filter_of(config: SensingConfig) -> tuple[str, AttitudeFilter]:
+    """Return the configured filter and the name of its own records."""
+    if config.attitude_method == DEFAULT_METHOD:
+        return "error_state", ERROR_STATE_FILTER
+    other = load(ATTITUDE, config.attitude_method, AttitudeFilter)
+    if other is None:
+        raise BenchError(f"'{config.attitude_method}' is no attitude filter; see the key attitude_method of the bench")
+    return "own", other
 
 
 def attitude_params(config: SensingConfig) -> Records[AttitudeParams]:
     """Return the parameters of alignment and of the configured filter."""
-    name = chosen_filter(config)
-    own: dict[str, Any] = {name: FILTERS[name].new_params(config)}
-    return new(
-        FILTERS[name].params,
+    name, chosen = _filter_of(config)
+    own: dict[str, Any] = {name: chosen.new_params(config)}
+    params = new(
+        chosen.params,
         align_samples=max(1.0, round(config.align_s * config.tick_hz)),
         dt_s=1.0 / config.tick_hz,
         **own,
     )
+    if name == "own":
+        state = new(chosen.state)
+        motion = Motion(np.zeros(3), np.zeros(3), True, 1.0)
+        params["own"]["begin"] = entry(chosen.begin, np.zeros(3), state[0], params[0])
+        params["own"]["step"] = entry(chosen.step, motion, state[0], params[0])
+    return params
 
 
 def attitude_state(config: SensingConfig) -> Records[AttitudeState]:
     """Return the state before the first sample."""
-    state = new(FILTERS[chosen_filter(config)].state)
+    state = new(_filter_of(config)[1].state)
     restart(state[0])
     return state
 

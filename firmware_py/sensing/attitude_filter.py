@@ -1,4 +1,4 @@
-"""Defines the one shape of all attitude filters. ``attitude.FILTERS`` is the table of them."""
+"""Defines the one shape of all attitude filters: the built-in one and those of packages (``micron.attitude``)."""
 
 from __future__ import annotations
 
@@ -47,12 +47,27 @@ class Motion(NamedTuple):
     dt_s: float
 
 
+@record
+class OwnEntries:
+    """Addresses of the kernels of a package's filter, which ``attitude_params`` fills. Its parameters begin so."""
+
+    begin: int = field("1")
+    step: int = field("1")
+
+
+@record
+class OwnNumbers(AttitudeParams):
+    """The attitude's parameters with those of a package's filter."""
+
+    own: OwnEntries = field("")
+
+
 @dataclass(frozen=True)
 class AttitudeFilter:
     """An attitude filter.
 
-    ``params`` and ``state`` are the attitude's records, with one of the filter's own that has its name in
-    ``attitude.FILTERS``; ``new_params(config)`` makes its parameters. The kernels take ``(input, state, params)``, the
+    ``params`` and ``state`` are the attitude's records, each with one of the filter's own, called ``own`` in a package;
+    ``new_params(config)`` makes its parameters. The kernels take ``(input, state, params)``, the
     whole records:
 
     - ``begin``: the field (3,), body frame, summed over the alignment. Sets the filter's own state.

@@ -13,7 +13,6 @@ from firmware_py.records import Records, new
 from firmware_py.sensing.config import DRIFT_S, SensingConfig
 from firmware_py.sensing.error_state_records import ErrorStateParams
 from firmware_py.sensing.magnet import MagnetParams
-from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanParams
 from hal.types import STANDARD_GRAVITY
 
 TREMOR_RAD_S2 = 0.5
@@ -169,39 +168,4 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Records[ErrorStateParam
             price=10.0,
             mean_s=0.03,
         ),
-    )
-
-
-def quaternion_kalman_params(config: SensingConfig) -> Records[QuaternionKalmanParams]:
-    """Numbers of the quaternion filter driven by accelerometers."""
-    density = np.diag(motion_densities(config))
-    return new(
-        QuaternionKalmanParams,
-        turn_density=1e-12,
-        # no state for the bias of alpha here: its drift is rate drift
-        rate_density=density[3:] + DRIFT_S * alpha_drift_densities(config),
-        lead=0.5,
-        up_density=(config.hand_acceleration_m_s2 / config.gravity_m_s2) ** 2,
-        field_density=heading_density(config),
-        start_variance=np.array([0.01**2, 0.02**2, 0.02**2]),
-        gravity=config.gravity_m_s2,
-        force_gate_m_s2=3.0,
-        field_gate=0.2,
-    )
-
-
-def gyroscope_quaternion_kalman(gravity_m_s2: float = 9.81) -> Records[QuaternionKalmanParams]:
-    """The quaternion filter for a consumer gyroscope."""
-    deg = radians(1.0)
-    return new(
-        QuaternionKalmanParams,
-        turn_density=(0.02 * deg) ** 2,
-        rate_density=(0.003 * deg) ** 2,
-        lead=1.0,
-        up_density=0.03**2,
-        field_density=deg**2,
-        start_variance=np.array([deg**2, (2.0 * deg) ** 2, (0.5 * deg) ** 2]),
-        gravity=gravity_m_s2,
-        force_gate_m_s2=1.0,
-        field_gate=0.15,
     )

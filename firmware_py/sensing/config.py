@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from hal.plugins import ATTITUDE, offered
 from hal.validation import NotNegative, Positive, validate_table
 
 Vector = tuple[float, float, float]
@@ -30,6 +31,8 @@ PER_AXIS = (
     "scale_out_of_plane",
 )
 """Keys with a value for each axis; absent ones are filled with the default of all."""
+DEFAULT_METHOD = "error-state"
+"""The built-in attitude filter; packages offer others in the group ``micron.attitude``."""
 DRIFT_S = 100.0
 """Time over which a slow drift is stated."""
 UNIT_AXES: tuple[Vector, ...] = (
@@ -40,6 +43,11 @@ UNIT_AXES: tuple[Vector, ...] = (
     (1.0, 0.0, 0.0),
     (0.0, 1.0, 0.0),
 )
+
+
+def attitude_methods() -> tuple[str, ...]:
+    """Return the names of the built-in attitude filter and of those of installed packages."""
+    return (DEFAULT_METHOD, *sorted(offered(ATTITUDE)))
 
 
 class SensingConfig(BaseModel):
@@ -102,7 +110,7 @@ class SensingConfig(BaseModel):
     kinematics_method: Literal["analytic", "numeric"] = "analytic"
     # analytic: a tick whose centripetal part changes by more than a tenth of a sample's noise is solved numerically
     kinematics_guard: bool = True
-    attitude_method: Literal["observer", "error-state", "quaternion-kalman"] = "error-state"
+    attitude_method: str = DEFAULT_METHOD
     # the slow part of the hand's velocity, rms, with its correlation time: error-state filter
     hand_velocity_m_s: Positive = 8e-5
     hand_velocity_s: Positive = 1.0
@@ -120,6 +128,15 @@ class SensingConfig(BaseModel):
     attitude_hz: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.5)  # about the body axes
     attitude_lowpass_hz: Positive = 1.5
     max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
+
+    @field_validator("attitude_method")
+    @classmethod
+    def _known(cls, method: str) -> str:
+        if method in attitude_methods():
+            return method
+        if method in ("observer", "quaternion-kalman"):
+            raise ValueError(f"'{method}' is a filter to compare with: only a source tree has it (tools/research)")
+        raise ValueError(f"'{method}' is no attitude filter; there are {', '.join(attitude_methods())}")
 
     @model_validator(mode="before")
     @classmethod

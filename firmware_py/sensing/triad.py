@@ -36,27 +36,3 @@ def triad(force: NDArray[np.float64], field: NDArray[np.float64], out: NDArray[n
     out[1, 0], out[1, 1], out[1, 2] = yx, yy, yz
     out[0, 0], out[0, 1], out[0, 2] = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
     return found
-
-
-@kernel
-def triad_covariance(
-    up: NDArray[np.float64],
-    field: NDArray[np.float64],
-    up_variance: float,
-    field_variance: float,
-    out: NDArray[np.float64],
-) -> None:
-    """``out`` (3, 3) rad^2: covariance of TRIAD's error angles, body frame, anchored on up (Ang 2004 (4.34), Shuster
-    1981).
-
-    ``up`` and ``field`` (3,) are unit vectors in the body frame, the variances those of their directions (rad^2, each
-    of two angles).
-    """
-    dot = up[0] * field[0] + up[1] * field[1] + up[2] * field[2]
-    sine2 = max(1.0 - dot * dot, 1e-6)
-    for i in range(3):
-        for j in range(3):
-            value = up_variance * dot * (up[i] * field[j] + field[i] * up[j])
-            value += (field_variance - up_variance) * up[i] * up[j]
-            out[i, j] = value / sine2
-        out[i, i] += up_variance

@@ -9,6 +9,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
+from firmware_py.sensing.config import attitude_methods
 from tools.bench.applied import Applied
 from tools.bench.calibrate import calibrate_routes
 from tools.bench.collect import collect_routes
@@ -19,7 +20,7 @@ from tools.bench.mismatch import mismatch_routes
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.bench.setup import setup_routes
-from tools.bench.shadow import METHODS
+from tools.bench.shadow import check_method
 from tools.calibrate.calibration_file import calibration_toml
 from tools.errors import InputError
 
@@ -69,7 +70,12 @@ def _attitude(session: Session, applied: Applied) -> list[BaseRoute]:
     async def filters(_: Request) -> Any:
         stages = json.loads(session.metadata().get("stages", "{}"))
         running = stages.get("sensing", {}).get("attitude_method", "")
-        return {"methods": METHODS if stages else (), "running": running, "stages": stages, "applied": applied.what}
+        return {
+            "methods": attitude_methods() if stages else (),
+            "running": running,
+            "stages": stages,
+            "applied": applied.what,
+        }
 
     async def compare(request: Request) -> Any:
         await session.compare(text(await body(request), "method"))
@@ -77,8 +83,7 @@ def _attitude(session: Session, applied: Applied) -> list[BaseRoute]:
     async def use(request: Request) -> Any:
         """The firmware starts again with another filter."""
         method = text(await body(request), "method")
-        if method not in METHODS:
-            raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(METHODS)}")
+        check_method(method)
         stages = {"sensing": {"attitude_method": method}}
         await applied.calibration("attitude filter", calibration_toml("attitude filter", "micron bench", stages))
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.stages import StageConfigs
 from firmware_py.frame import LAYOUT, QUATERNION, STATUS, VOLTS, FrameStatus
-from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.config import SensingConfig, attitude_methods
 from firmware_py.sensing.stage import Sensing
 from tools.errors import InputError
 
-METHODS: tuple[str, ...] = get_args(SensingConfig.model_fields["attitude_method"].annotation)
 _GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE)
 MAX_ROWS = 200
 """Followed per call; a server that was late skips, as the filter coasts over gaps."""
@@ -46,10 +45,15 @@ class Shadow:
         return self._frame[QUATERNION : QUATERNION + 4].tolist()
 
 
+def check_method(method: str) -> None:
+    """Raise ``InputError`` if no attitude filter has this name."""
+    if method not in attitude_methods():
+        raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(attitude_methods())}")
+
+
 async def make_shadow(metadata: dict[str, Any], method: str) -> Shadow:
     """Return a shadow of the running firmware with another ``method``. Raises ``InputError`` for an unknown method."""
-    if method not in METHODS:
-        raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(METHODS)}")
+    check_method(method)
     if not metadata:
         raise InputError("no firmware is running")
     if "stages" not in metadata:

@@ -10,7 +10,8 @@ from firmware_py.records import attributes, new
 from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.error_state import propagate_errors
 from firmware_py.sensing.error_state_records import ERRORS, ErrorState
-from firmware_py.sensing.triad import triad, triad_covariance
+from firmware_py.sensing.triad import triad
+from tools.research.attitude.quaternion_kalman import triad_covariance
 from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 
 RATE_HZ = 200.0

@@ -77,6 +77,23 @@ def test_tip_displacement_has_the_stated_response(trembling: tuple[np.ndarray, M
     np.testing.assert_allclose(ours, true * response, atol=0.05 * np.abs(true).max())
 
 
+@pytest.mark.parametrize("method", ["observer", "quaternion-kalman"])
+def test_the_filter_of_a_package_finds_the_attitude(trembling: tuple[np.ndarray, Motion], method: str) -> None:
+    frames, motion = trembling[0][:2000].copy(), trembling[1]
+    run(frames, SensingConfig(attitude_method=method))
+    ours = Rotation.from_quat(frames[-1, LAYOUT["quaternion"]], scalar_first=True)
+    assert np.degrees((ours * motion.attitude[1999].inv()).magnitude()) < 1.0  # as in the slow hand below
+    assert np.any(frames[-1, LAYOUT["quaternion"]] != trembling[0][1999, LAYOUT["quaternion"]])
+
+
+def test_an_installed_wheel_says_where_the_other_filters_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("firmware_py.sensing.config.offered", lambda group: {})
+    with pytest.raises(BenchError, match="'observer' is a filter to compare with: only a source tree has it"):
+        SensingConfig.from_dict({"attitude_method": "observer"})
+    with pytest.raises(BenchError, match="there are error-state"):
+        SensingConfig.from_dict({"attitude_method": "kalman"})
+
+
 def test_attitude_follows_a_slow_hand_with_noisy_sensors() -> None:
     seconds = 20.0
     sway = tone(seconds, 0.2, np.array([0.05, -0.04, 0.06]))

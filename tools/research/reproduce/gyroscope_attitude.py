@@ -8,14 +8,19 @@ from numpy.typing import NDArray
 from firmware_py.records import Record, new
 from firmware_py.sensing.attitude import restart
 from firmware_py.sensing.attitude_filter import Motion
-from firmware_py.sensing.attitude_params import gyroscope_error_state, gyroscope_quaternion_kalman
+from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.fusion import ALIGN_S, Fusion, FusionConfig
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope
 from firmware_py.sensing.quaternion import from_matrix
-from firmware_py.sensing.quaternion_kalman import begin_quaternion_kalman, quaternion_kalman_step
-from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanAttitude, QuaternionKalmanNumbers
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
+from tools.research.attitude.quaternion_kalman import (
+    QuaternionKalmanAttitude,
+    QuaternionKalmanNumbers,
+    begin_quaternion_kalman,
+    gyroscope_quaternion_kalman,
+    quaternion_kalman_step,
+)
 
 
 @kernel
@@ -88,7 +93,7 @@ def gyroscope_attitude(
     params = new(
         QuaternionKalmanNumbers,
         dt_s=1.0 / rate_hz,
-        quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2),
+        own=gyroscope_quaternion_kalman(gravity_m_s2),
     )
     state = new(QuaternionKalmanAttitude)
     run_kernel(w, f, b, align, params, state, out)

@@ -63,7 +63,7 @@ export function mount(root, { link, catalogue }) {
   async function listFilters() {
     const found = await get("/api/filters");
     running = found.running;
-    beside.hidden = !found.methods.length;
+    beside.hidden = found.methods.length < 2;
     title.replaceChildren("Firmware: ", h("b", { style: "color:var(--text)" }, running));
     if (!choice.options.length) choice.replaceChildren(h("option", { value: "" }, "nothing"), ...found.methods.map((m) => h("option", { value: m }, m)));
     choice.value = link.state?.shadow || "";

@@ -12,17 +12,114 @@ Measurements while the specific force is not g, or the field not the learned one
 
 from __future__ import annotations
 
-from math import sqrt
+from math import radians, sqrt
 
 import numpy as np
 
-from firmware_py.records import Array
-from firmware_py.sensing.attitude_filter import AttitudeFilter, Motion
-from firmware_py.sensing.attitude_params import quaternion_kalman_params
+from firmware_py.records import Array, Records, field, new, record
+from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnEntries
+from firmware_py.sensing.attitude_params import alpha_drift_densities, heading_density, motion_densities
+from firmware_py.sensing.config import DRIFT_S, SensingConfig
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
-from firmware_py.sensing.quaternion_kalman_records import QuaternionKalmanAttitude, QuaternionKalmanNumbers
-from firmware_py.sensing.triad import triad, triad_covariance
+from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
+
+
+@record
+class QuaternionKalmanParams(OwnEntries):
+    """Densities and limits of the filter, body axes where there are three."""
+
+    turn_density: Array = field("rad^2/s", 3)  # white noise of the rate
+    rate_density: Array = field("(rad/s)^2/s", 3)  # random walk of its error (Xi_alpha for accelerometers, erratum 44)
+    lead: float = field("1")
+    up_density: float = field("rad^2 s")  # of the direction of gravity, the hand's accelerations included
+    field_density: float = field("rad^2 s")  # of the direction of the field
+    start_variance: Array = field("rad^2, rad^2, (rad/s)^2", 3)  # of tilt, heading, rate
+    gravity: float = field("m/s^2")
+    force_gate_m_s2: float = field("m/s^2")
+    field_gate: float = field("1")  # relative
+
+
+@record
+class QuaternionKalman:
+    """The filter's own state."""
+
+    covariance: Array = field("products of 1 and rad/s", 7, 7)
+    field_size: float = field("uT")
+    rejected: int = field("1")
+
+
+@record
+class QuaternionKalmanAttitude(AttitudeState):
+    """The attitude's state with the quaternion filter's."""
+
+    own: QuaternionKalman = field("")
+
+
+@record
+class QuaternionKalmanNumbers(AttitudeParams):
+    """The attitude's parameters with the quaternion filter's."""
+
+    own: QuaternionKalmanParams = field("")
+
+
+def _params(config: SensingConfig) -> Records[QuaternionKalmanParams]:
+    """Numbers of the quaternion filter driven by accelerometers."""
+    density = np.diag(motion_densities(config))
+    return new(
+        QuaternionKalmanParams,
+        turn_density=1e-12,
+        # no state for the bias of alpha here: its drift is rate drift
+        rate_density=density[3:] + DRIFT_S * alpha_drift_densities(config),
+        lead=0.5,
+        up_density=(config.hand_acceleration_m_s2 / config.gravity_m_s2) ** 2,
+        field_density=heading_density(config),
+        start_variance=np.array([0.01**2, 0.02**2, 0.02**2]),
+        gravity=config.gravity_m_s2,
+        force_gate_m_s2=3.0,
+        field_gate=0.2,
+    )
+
+
+def gyroscope_quaternion_kalman(gravity_m_s2: float = 9.81) -> Records[QuaternionKalmanParams]:
+    """The quaternion filter for a consumer gyroscope."""
+    deg = radians(1.0)
+    return new(
+        QuaternionKalmanParams,
+        turn_density=(0.02 * deg) ** 2,
+        rate_density=(0.003 * deg) ** 2,
+        lead=1.0,
+        up_density=0.03**2,
+        field_density=deg**2,
+        start_variance=np.array([deg**2, (2.0 * deg) ** 2, (0.5 * deg) ** 2]),
+        gravity=gravity_m_s2,
+        force_gate_m_s2=1.0,
+        field_gate=0.15,
+    )
+
+
+@kernel
+def triad_covariance(
+    up: Array,
+    field: Array,
+    up_variance: float,
+    field_variance: float,
+    out: Array,
+) -> None:
+    """``out`` (3, 3) rad^2: covariance of TRIAD's error angles, body frame, anchored on up (Ang 2004 (4.34), Shuster
+    1981).
+
+    ``up`` and ``field`` (3,) are unit vectors in the body frame, the variances those of their directions (rad^2, each
+    of two angles).
+    """
+    dot = up[0] * field[0] + up[1] * field[1] + up[2] * field[2]
+    sine2 = max(1.0 - dot * dot, 1e-6)
+    for i in range(3):
+        for j in range(3):
+            value = up_variance * dot * (up[i] * field[j] + field[i] * up[j])
+            value += (field_variance - up_variance) * up[i] * up[j]
+            out[i, j] = value / sine2
+        out[i, i] += up_variance
 
 
 @kernel
@@ -37,7 +134,7 @@ def tilde(q: Array, out: Array) -> None:
 @kernel
 def begin_quaternion_kalman(field: Array, state: QuaternionKalmanAttitude, params: QuaternionKalmanNumbers) -> None:
     """Set the covariance and the start values after alignment."""
-    k, numbers = state.quaternion_kalman, params.quaternion_kalman
+    k, numbers = state.own, params.own
     q = np.empty((4, 3))
     tilde(state.quaternion, q)
     angles = np.zeros((3, 3))
@@ -55,7 +152,7 @@ def begin_quaternion_kalman(field: Array, state: QuaternionKalmanAttitude, param
 @kernel
 def quaternion_kalman_step(motion: Motion, state: QuaternionKalmanAttitude, params: QuaternionKalmanNumbers) -> None:
     """Run one step; the field in the state is the last one known (body frame)."""
-    k, numbers = state.quaternion_kalman, params.quaternion_kalman
+    k, numbers = state.own, params.own
     force, alpha, field, dt = motion.force, motion.alpha, state.field, motion.dt_s
     turn = np.empty(3)
     for i in range(3):
@@ -147,10 +244,6 @@ def quaternion_kalman_step(motion: Motion, state: QuaternionKalmanAttitude, para
     to_matrix(state.quaternion, state.matrix)
 
 
-QUATERNION_KALMAN_FILTER = AttitudeFilter(
-    QuaternionKalmanNumbers,
-    QuaternionKalmanAttitude,
-    quaternion_kalman_params,
-    begin_quaternion_kalman,
-    quaternion_kalman_step,
+FILTER = AttitudeFilter(
+    QuaternionKalmanNumbers, QuaternionKalmanAttitude, _params, begin_quaternion_kalman, quaternion_kalman_step
 )

@@ -17,7 +17,7 @@ from math import atan2, exp, pi, sqrt
 import numpy as np
 
 from firmware_py.records import Array, Records, field, new, record
-from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion
+from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnEntries
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
@@ -28,7 +28,7 @@ LOWPASS_PER_CORNER = 6.0
 
 
 @record
-class ObserverParams:
+class ObserverParams(OwnEntries):
     """Corners of the observer; ``corner_rad_s`` about each body axis."""
 
     start_rad_s: float = field("rad/s")
@@ -47,17 +47,17 @@ class ObserverState:
 class ObservedAttitude(AttitudeState):
     """The attitude's state with the observer's."""
 
-    observer: ObserverState = field("")
+    own: ObserverState = field("")
 
 
 @record
 class ObserverNumbers(AttitudeParams):
     """The attitude's parameters with the observer's."""
 
-    observer: ObserverParams = field("")
+    own: ObserverParams = field("")
 
 
-def observer_params(config: SensingConfig) -> Records[ObserverParams]:
+def _params(config: SensingConfig) -> Records[ObserverParams]:
     """Return the observer's numbers."""
     return new(
         ObserverParams,
@@ -71,13 +71,13 @@ def observer_params(config: SensingConfig) -> Records[ObserverParams]:
 def begin_observer(north: Array, state: ObservedAttitude, params: ObserverNumbers) -> None:
     """Start without an error."""
     for i in range(3):
-        state.observer.error[i] = 0.0
+        state.own.error[i] = 0.0
 
 
 @kernel
 def step_observer(motion: Motion, state: ObservedAttitude, params: ObserverNumbers) -> None:
     """Predict with alpha, correct with gravity and field."""
-    own, numbers, dt = state.observer, params.observer, motion.dt_s
+    own, numbers, dt = state.own, params.own, motion.dt_s
     # --- error of the present attitude, body frame: measured up x predicted up, and heading about up
     c = state.matrix
     fx, fy, fz = motion.force[0], motion.force[1], motion.force[2]
@@ -111,4 +111,4 @@ def step_observer(motion: Motion, state: ObservedAttitude, params: ObserverNumbe
     to_matrix(state.quaternion, state.matrix)
 
 
-OBSERVER = AttitudeFilter(ObserverNumbers, ObservedAttitude, observer_params, begin_observer, step_observer)
+FILTER = AttitudeFilter(ObserverNumbers, ObservedAttitude, _params, begin_observer, step_observer)
