@@ -122,7 +122,7 @@ class BenchFile:
 
 def load_bench(path: Path) -> BenchFile:
     """Read and check a bench file. Raises ``BenchError`` with file and key."""
-    text = read_text(path, "name an existing bench file with --bench")
+    text = read_text(path, "name an existing bench file")
     try:
         table = parse_toml(text, str(path))
     except tomllib.TOMLDecodeError as error:

@@ -6,6 +6,7 @@ import ctypes
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +43,12 @@ def use_one_thread() -> None:
 
 
 def begin_as_worker() -> None:
-    """Leave Ctrl-C to the process that started this one, and end with it (Linux)."""
+    """Leave Ctrl-C to the process that started this one, and end with it (Linux).
+
+    A thread that serves a cluster changes nothing: its process belongs to the cluster.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG

@@ -42,7 +42,7 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Seed of the search; the same recording and seed give the same answer.")
 ]
 MOST_SHARED = 1_000_000
-"""Samples above which one process works alone: every further one would hold a gigabyte of columns of its own."""
+"""Samples above which one process of this machine works alone: each further one would hold a gigabyte of columns."""
 
 
 def diagnose(
@@ -59,7 +59,8 @@ def diagnose(
     seed: SeedOption = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one per core.")] = None,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="With a folder: run on this Dask cluster (extra 'dask').")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="With a folder or --together: run on this Dask cluster (extra 'dask')."),
     ] = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
@@ -84,13 +85,11 @@ def diagnose(
         check_folder(out)
         processes = jobs or os.cpu_count() or 1
         if together:
-            if dask is not None:
-                raise InputError("--together runs on this machine; leave --dask out")
             from tools.mismatch.together import load_together, recordings_of
 
             decide_on([*recordings_of(recordings).values()], trust, allow_outside)
             joined = load_together(recordings, per_recording or [])
-            _show(_diagnose_one(joined, held_out, seed, processes), json_file, html, out)
+            _show(_diagnose_together(joined, held_out, seed, processes, dask), json_file, html, out)
             return
         if per_recording:
             raise InputError("--per-recording needs --together: it says what differs between recordings")
@@ -108,12 +107,22 @@ def diagnose(
             _diagnose_folder(recording, json_file, out, held_out=held_out, seed=seed, jobs=processes, dask=dask)
             return
         if dask is not None:
-            raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
+            raise InputError("--dask spreads a folder of recordings, or several --together; for one use --jobs")
         report = _diagnose_one(recording, held_out, seed, processes)
         _show(report, json_file, html, out)
 
 
-def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int) -> Report:
+def _diagnose_together(joined: Recording, held_out: float, seed: int, jobs: int, dask: str | None) -> Report:
+    if dask is None:
+        return _diagnose_one(joined, held_out, seed, jobs)
+    from tools.mismatch.batch import on_cluster
+
+    with on_cluster(dask) as threads:
+        # with one job the engine would work here
+        return _diagnose_one(joined, held_out, seed, max(2, threads), here=False)
+
+
+def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, *, here: bool = True) -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from tools.mismatch.infer import diagnose
@@ -131,8 +140,7 @@ def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs:
         def show(what: str, done: int, total: int) -> None:
             progress.update(bar, description=what, completed=done, total=total)
 
-        alone = loaded.n > MOST_SHARED
-        shared = 1 if alone else jobs
+        shared = 1 if here and loaded.n > MOST_SHARED else jobs
         return diagnose(loaded, held_out=held_out, seed=seed, jobs=shared, progress=show)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -48,5 +49,8 @@ def heal(
         for line in healing.lines(found):
             say.print(line, highlight=False, markup=False, soft_wrap=True)
         if found.bench is not None:
-            console().print(f"healed bench: {found.bench}; try: micron run --virtual --bench {found.bench}")
+            console().print(
+                f"healed bench: {found.bench}; try: micron run --virtual --bench {shlex.quote(found.bench)}",
+                soft_wrap=True,
+            )
         write_json(found.to_json(), json_file)

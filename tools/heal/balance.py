@@ -54,8 +54,9 @@ class Balance:
         )
 
     def __str__(self) -> str:
-        factors = ", ".join(f"{name} x {getattr(self, name):g}" for name in ("quiet", "drift", "relative"))
-        return f"cancelling from {self.fade_hz:g} Hz higher, {factors}"
+        fade = [f"cancelling from {self.fade_hz:g} Hz higher"] if self.fade_hz else []
+        factors = {name: getattr(self, name) for name in ("quiet", "drift", "relative")}
+        return ", ".join([*fade, *(f"{name} x {factor:g}" for name, factor in factors.items() if factor != 1.0)])
 
 
 def next_balance(balance: Balance, rising: Collection[str]) -> Balance | None:

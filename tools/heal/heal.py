@@ -25,6 +25,8 @@ TRY_FROM, VERIFY_FROM = 1000, 5000
 the experiments."""
 VERIFY_RUNS = 2
 """Number of runs that decide for each run on which a remedy is tried."""
+MOVES_OUTPUTS = 4
+"""Least ``--max-effect`` at which an experiment may move the outputs of a real bench."""
 NO_RISE = 0.5
 """Level at which a band counts as risen on the runs where a remedy is tried: its mean must not rise at all."""
 STACK_EFFECTS = frozenset(
@@ -80,10 +82,10 @@ class Healed:
 def check_bench(bench: BenchFile, max_effect: int | None) -> None:
     """Raise InputError for a bench that cannot be healed: a real one, or one with sensors unknown to the lab."""
     if not all(bus.uri.startswith(SIM_SCHEME) for bus in bench.description.bus.values()):
-        if max_effect is None:
+        if max_effect is None or max_effect < MOVES_OUTPUTS:
             raise InputError(
-                f"{bench.path}: healing moves the outputs of a real bench over their full range; allow it with "
-                "--max-effect 4, or heal an emulated copy"
+                f"{bench.path}: healing moves the outputs of a real bench over their full range, which needs "
+                f"--max-effect {MOVES_OUTPUTS} and strokes that an instrument of yours measures; heal an emulated copy"
             )
         raise InputError(
             f"{bench.path}: on a real bench the strokes have to be measured by an instrument of yours; record them "

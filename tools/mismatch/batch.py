@@ -1,7 +1,8 @@
 """Diagnoses a folder of recordings in parallel: on this machine (joblib) or on a Dask cluster.
 
 Each process diagnoses one recording with one thread: the work consists of many small matrices, on which several threads
-of a linear algebra library only compete for the same core.
+of a linear algebra library only compete for the same core. The pieces of one long diagnosis go to a cluster by the
+same joblib (``on_cluster``).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import importlib.util
 import shlex
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -20,6 +22,8 @@ from tools.errors import InputError
 from tools.mismatch.report.wording import number, scaled, words
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from tools.mismatch.engine.report import Report
 
 RETRIES = 5
@@ -162,20 +166,12 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
     """Yield rows as they finish, from the workers of a Dask cluster.
 
     Workers need this package and the same file system. A recording whose worker is lost goes to another one. Dask's
-    nanny starts workers with one thread for linear algebra (its ``pre-spawn-environ``).
-    Raises InputError when the extra is missing or nobody answers at ``address``.
+    nanny starts workers with one thread for linear algebra (its ``pre-spawn-environ``). Raises InputError as
+    ``_client`` does.
     """
-    if importlib.util.find_spec("distributed") is None:
-        raise InputError("--dask needs the Dask client: pip install 'micron-bench[dask]'")
-    from distributed import Client, as_completed
+    with _client(address) as client, client.as_current():
+        from distributed import as_completed
 
-    try:
-        client = Client(address, timeout="10s", set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(
-            f"--dask {address}: no Dask scheduler answers there ({error}); start one or fix the address"
-        ) from error
-    with client, client.as_current():
         futures = {
             client.submit(work, job, key=f"mismatch-{job.name}", retries=RETRIES, pure=False): job for job in jobs
         }
@@ -187,6 +183,37 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
                 yield future.result()
             else:
                 yield Row(job.name, str(job.path), error=f"lost on the cluster: {failure}")
+
+
+@contextmanager
+def on_cluster(address: str) -> Iterator[int]:
+    """Let the engine's parallel work run on a Dask cluster inside this context, which gives the number of its threads.
+
+    A piece of work whose worker is lost goes to another one. Raises InputError as ``_client`` does, and for a cluster
+    without workers.
+    """
+    from joblib import parallel_config
+
+    with _client(address) as client:
+        threads = sum(client.nthreads().values())
+        if threads == 0:
+            raise InputError(f"--dask {address}: the scheduler has no workers; start one: dask worker {address}")
+        with parallel_config(backend="dask", client=client, retries=RETRIES, pure=False):
+            yield threads
+
+
+def _client(address: str) -> Client:
+    """Connect to a Dask scheduler. Raises InputError when the extra is missing or nobody answers at ``address``."""
+    if importlib.util.find_spec("distributed") is None:
+        raise InputError("--dask needs the Dask client: pip install 'micron-bench[dask]'")
+    from distributed import Client
+
+    try:
+        return Client(address, timeout="10s", set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"--dask {address}: no Dask scheduler answers there ({error}); start one or fix the address"
+        ) from error
 
 
 def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:

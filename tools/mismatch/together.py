@@ -35,10 +35,21 @@ def recordings_of(paths: Sequence[Path]) -> dict[str, Path]:
             if one.is_file() and one.suffix != ".toml":
                 raise InputError(f"{one}: is not a recording; name its folder or its .toml file")
             found += [*find(one).values()] if is_folder_of_recordings(one) else [one]
-    files = dict.fromkeys((p / "recording.toml" if p.is_dir() else p) for p in found)
-    whole = [str(p.parent if p.name == "recording.toml" else p.with_suffix("")) for p in files]
-    above = os.path.commonpath([str(Path(p).parent) for p in whole]) if len(whole) > 1 else ""
-    return {os.path.relpath(w, above) if above else w: p for w, p in zip(whole, files, strict=True)}
+    named = [p / "recording.toml" if p.is_dir() else p for p in found]
+    # a recording with two names is one; the first name in the command stays
+    files = list({p.resolve(): p for p in reversed(named)}.values())[::-1]
+    whole = [p.parent if p.name == "recording.toml" else p.with_suffix("") for p in files]
+    if len(whole) < 2:
+        return dict(zip(map(str, whole), files, strict=True))
+    above = _folder_above([w.parent for w in whole])
+    return {os.path.relpath(w, above): p for w, p in zip(whole, files, strict=True)}
+
+
+def _folder_above(folders: Sequence[Path]) -> Path:
+    """Return the deepest folder that holds all ``folders``, relative to the current one if they all are."""
+    if any(f.is_absolute() for f in folders):
+        folders = [f.absolute() for f in folders]
+    return Path(os.path.commonpath(folders) or ".")
 
 
 def load_together(paths: Sequence[Path], per_recording: Sequence[str] = ()) -> Recording:
@@ -116,7 +127,7 @@ def join(loaded: dict[str, Recording], per_recording: tuple[str, ...] = ()) -> R
     notes += [f"{name}: its [split] is not used" for name, r in loaded.items() if r.split != Split()]
     return replace(
         first,
-        path=Path(os.path.commonpath([str(r.path.parent) for r in all_of]) or "."),
+        path=_folder_above([r.path.parent for r in all_of]),
         title=f"{len(all_of)} recordings",
         t=np.arange(int(begins[-1])) * first.dt,
         split=Split(),

@@ -153,6 +153,10 @@ BAD_DIAGNOSE = {
     "no folder for out": (lambda f: [f / "stack", "--out", f / "no" / "o"], "does not exist; create it first"),
     "out is a file": (lambda f: [f / "stack", "--out", f / "stack" / "data.npz"], "is a file; name a folder"),
     "dask for one": (lambda f: [f / "stack", "--dask", "tcp://127.0.0.1:1"], "--dask spreads a folder"),
+    "no cluster for several together": (
+        lambda f: [f / "stack", _stack_with(f, TWIN, TWIN), "--together", "--dask", "tcp://127.0.0.1:1"],
+        "no Dask scheduler answers there",
+    ),
     "html for many": (lambda f: [f, "--html", f / "r.html"], "use --out FOLDER"),
     "empty folder": (lambda f: [f / "empty"], "no recording.toml"),
     "held-out too large": (lambda f: [f / "stack", "--held-out", "0.9"], "held-out"),

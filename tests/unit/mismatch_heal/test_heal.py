@@ -98,6 +98,11 @@ def test_a_band_that_rises_with_all_weights_reverts_it(monkeypatch: pytest.Monke
     assert "but 20-500 Hz rises by 0.1 um" in why
 
 
+def test_a_balance_says_what_it_changes():
+    assert str(Balance(fade_hz=1.0, drift=2.0)) == "cancelling from 1 Hz higher, drift x 2"
+    assert str(Balance(relative=0.5)) == "relative x 0.5"
+
+
 def test_a_balance_changes_three_weights_and_keeps_the_others(tmp_path: Path):
     bench = load_bench(MICRON)
     was = load_plan(bench).stages.tremor.adaptive
@@ -188,7 +193,9 @@ def test_a_real_bench_is_refused_without_max_effect_and_nothing_is_written(tmp_p
     )
     bench = tmp_path / "real.toml"
     bench.write_text(text)
-    for more, message in (([], "--max-effect 4"), (["--max-effect", "4"], "instrument of yours")):
+    refusals = (([], "needs --max-effect 4"), (["3"], "needs --max-effect 4"), (["4"], "then micron calibrate piezo"))
+    for effect, message in refusals:
+        more = [o for e in effect for o in ("--max-effect", e)]
         result = CliRunner().invoke(app, ["mismatch", "heal", str(bench), "--out", str(tmp_path / "out"), *more])
         assert result.exit_code == 2
         assert message in " ".join(result.stderr.split())
@@ -201,6 +208,7 @@ def test_a_real_bench_is_refused_without_max_effect_and_nothing_is_written(tmp_p
         ("nowhere.toml", "no such bench file"),
         ("endoscope", "has no tip that is compensated"),
         ("micron-can", "exactly one dac_amplifier"),
+        (".", "is no regular file); name an existing bench file"),
     ],
 )
 def test_a_bench_that_cannot_be_healed_is_refused_and_nothing_is_written(tmp_path: Path, bench: str, message: str):

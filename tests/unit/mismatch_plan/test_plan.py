@@ -331,6 +331,8 @@ def test_a_report_of_another_twin_or_without_a_group_is_refused(recorded: Path, 
     moved = {**report["fit"], "base_parameters": given}
     with pytest.raises(InputError, match="of another twin"):
         plan_for(recorded, {**report, "fit": moved}, Asked())
+    with pytest.raises(InputError, match="the report has no physics"):
+        plan_for(recorded, {"format": 1, "verdict": "leaves", "twin": "twin.toml", "fit": {}}, Asked())
     with pytest.raises(InputError, match="nothing to split"):
         plan_for(recorded, {**report, "equivalent": []}, Asked())
 

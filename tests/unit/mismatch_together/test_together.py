@@ -91,6 +91,19 @@ def test_folders_patterns_and_files_are_taken_once(tmp_path: Path) -> None:
     assert len(load_together(again).parts) == 3
 
 
+def test_relative_and_absolute_names_of_one_recording_are_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(2):
+        write(tmp_path / "runs" / f"day{k}", k, n=100)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path / "runs" / "day1")
+    mixed = [Path("runs/day0"), tmp_path / "runs" / "day1", tmp_path / "runs" / "day0" / "recording.toml", Path("link")]
+    joined = load_together(mixed)
+    assert [p.name for p in joined.parts] == ["day0", "day1"]
+    assert joined.path == tmp_path / "runs"
+    assert load_together([Path("runs")]).path == Path("runs")
+    assert load_together([Path("runs/day0"), Path("link")]).path == Path(".")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [

@@ -11,6 +11,7 @@ import numpy as np
 
 from tools.errors import InputError
 from tools.mismatch import units
+from tools.mismatch.apply import check_report
 from tools.mismatch.plan import structure
 from tools.mismatch.plan.design import Plan, Progress, design
 from tools.mismatch.plan.limits import Limits, Wish, limits_json, settle_limits
@@ -160,6 +161,7 @@ def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Prog
     limits = limits_of(where, asked)
     floors = noise_of(report)
     sigma = {o: where.noise(o, floors) for o in where.template.outputs}
+    check_report(where.template, report)
     groups = groups_of(report)
     if not groups:
         raise InputError(

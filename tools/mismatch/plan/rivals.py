@@ -8,7 +8,7 @@ from typing import Any
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.errors import InputError, RecordingError
-from tools.mismatch.apply import EVENTS, check_report, report_effects
+from tools.mismatch.apply import EVENTS, report_effects
 from tools.mismatch.plan.models import Rival, best_rival, fitted_rival
 from tools.mismatch.plan.situation import Situation, problem_of
 from tools.mismatch.recording import TwinText
@@ -42,13 +42,12 @@ def rivals_of(
 ) -> list[Rival]:
     """Return the named model and, for each other effect of ``group``, the model with that one in its place.
 
-    Raises InputError for a report of another recording or twin, or if the recording has no samples to fit rivals to.
+    Raises InputError for a report of another twin, or if the recording has no samples to fit rivals to.
     """
     if not where.recorded:
         raise InputError(
             f"{where.path}: rivals are fitted to the recording of the report; give that recording, not a twin alone"
         )
-    check_report(where.template, report)
     _same_twin(where, report)
     base = dict(report["corrected_base"])
     before = list(base.pop("effects", []))

@@ -151,9 +151,11 @@ def _departures(
 def lines(watched: Watched) -> list[str]:
     """Return the lines that the command prints, a sentence per line."""
     (a, b), (c, d) = watched.reference_s, watched.watched_s
+    count = len(watched.channels)
+    where = "in one channel" if count == 1 else f"in {count} channels together"
     out = [
         f"Reference: {a:.4g} to {b:.4g} s. Watched: {c:.4g} to {d:.4g} s in blocks of {watched.block_s:.3g} s, at most "
-        f"{watched.false_alarms_per_hour:g} false alarms per hour in {len(watched.channels)} channels."
+        f"{watched.false_alarms_per_hour:g} false alarms per hour {where}."
     ]
     for departure in watched.departures:
         out.append(sentence(departure))

@@ -127,6 +127,7 @@ def learn(
     block = max(LEAST_BLOCK, round(BLOCK_S / dt))
     n = next(iter(residuals.values())).size
     stretches = [(a, b) for a, b in zip((0, *restarts), (*restarts, n), strict=True) if b > a]
+    _check_length(sum((b - a) // block for a, b in stretches), block, dt)
     channels: list[Channel] = []
     left_out: dict[str, str] = {}
     for name, residual in residuals.items():
@@ -158,18 +159,23 @@ def _channel(name: str, residual: Array, stretches: list[tuple[int, int]], block
     raw = np.concatenate(parts)
     means = [residual[a : b - (b - a) % block].reshape(-1, block).mean(axis=1) for a, b in stretches]
     wander_s = correlation_blocks(np.concatenate(means)) * block * dt
-    if raw.shape[0] < LEAST_BLOCKS:
-        need = (LEAST_BLOCKS * block + whitener.warm_up) * dt
-        raise InputError(
-            f"the reference gives {raw.shape[0]} blocks of {block * dt:g} s, at least {LEAST_BLOCKS} are needed: "
-            f"take a longer one (about {need:.0f} s with --reference)"
-        )
+    _check_length(raw.shape[0], block, dt, whitener.warm_up)
     centre, scale = raw.mean(axis=0), np.maximum(raw.std(axis=0, ddof=1), 1e-12)
     figures = np.clip((raw - centre) / scale, -CLIP, CLIP)
     bounds = np.stack([np.stack([_bound(s * figures[:, f]) for s in (1, -1)]) for f in range(2)])
     if residual.size * dt < LEAST_PIECES * wander_s:
         bounds[0] = np.inf
     return Channel(name, float(np.sqrt(np.mean(residual**2))), wander_s, whitener, offset, centre, scale, bounds)
+
+
+def _check_length(blocks: int, block: int, dt: float, warm_up: int = 0) -> None:
+    """Raise InputError if a reference has fewer ``blocks`` of ``block`` samples than the test needs."""
+    if blocks < LEAST_BLOCKS:
+        need = (LEAST_BLOCKS * block + warm_up) * dt
+        raise InputError(
+            f"the reference gives {blocks} blocks of {block * dt:g} s, at least {LEAST_BLOCKS} are needed: "
+            f"take a longer one (about {need:.0f} s with --reference)"
+        )
 
 
 def correlation_blocks(means: Array) -> float:

@@ -127,7 +127,8 @@ def page(options: argparse.Namespace, lines: Sequence[str], watched: Watching | 
         notes = f" Without a break: {len(watched.reference_rms)} channels, {watched.gaps} gaps, phase {watched.phase}."
     return f"""# A twin that watches
 
-Made by `python -m tools.research.prove.watch_measure --seed {options.seed} --out docs/results/watch.json`, revision
+Made by `python -m tools.research.prove.watch_measure --seed {options.seed} --seconds {options.seconds:g} --reference
+{options.reference:g} --per-hour {options.per_hour:g} --hours {options.hours:g} --out docs/results/watch.json`, revision
 {revision_and_day()}; do not edit.
 
 | figure | goal | measured |
