@@ -195,7 +195,7 @@ def on_cluster(address: str) -> Iterator[int]:
     from joblib import parallel_config
 
     with _client(address) as client:
-        threads = sum(client.nthreads().values())
+        threads = sum(cast(dict[str, int], client.nthreads()).values())  # of a client that is not asynchronous
         if threads == 0:
             raise InputError(f"--dask {address}: the scheduler has no workers; start one: dask worker {address}")
         with parallel_config(backend="dask", client=client, retries=RETRIES, pure=False):
