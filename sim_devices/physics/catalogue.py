@@ -24,12 +24,14 @@ from sim_devices.physics.friction import BOUC_WEN, COULOMB_FRICTION, SMOOTH_SPRI
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
+from sim_devices.physics.load import CONSTANT_LOAD
 from sim_devices.physics.parameter import PARAMETER_VARIATION
 from sim_devices.physics.quantization import QUANTIZATION
 from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
 from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_ERROR
 from sim_devices.physics.saturation import SATURATION
+from sim_devices.physics.scale import SCALE_ERROR
 from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.spring import CLEARANCE, COGGING_FORCE, CUBIC_STIFFNESS, GRAVITY_LOAD
@@ -81,6 +83,8 @@ _ALL = (
     OVERFLOW,
     PARAMETER_VARIATION,
     ONE_SIDED_CONDUCTION,
+    CONSTANT_LOAD,
+    SCALE_ERROR,
 )
 
 

@@ -271,6 +271,9 @@ class Effect:
     """True if an effect of kind add is proportional to the signal. Behind columns of simulated output it cannot be
     distinguished from wrong parameters of the simulation."""
 
+    shifts_line: bool = False
+    """True if it changes a gain or a zero alone: it has no place where the simulation's own are re-fitted."""
+
     @property
     def is_linear(self) -> bool:
         """True if the effect maps the signal linearly."""

@@ -47,4 +47,6 @@ NAMES = (
     "overflow",
     "parameter_variation",
     "one_sided_conduction",
+    "constant_load",
+    "scale_error",
 )

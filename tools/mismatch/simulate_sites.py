@@ -42,6 +42,8 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return f"not in a {twin.kind}"
     if not set(effect.stages) & set(twin.chain):
         return f"no {' or '.join(effect.stages)} in the chain of this twin"
+    if effect.shifts_line and _commutes(twin):
+        return "gain and zero of this twin are re-fitted"
     if effect.kind == "feedback" and not twin.feedback_on:
         return "the twin has no equation of motion"
     if effect.kind == "feedback" and not _acts_at(twin, effect):

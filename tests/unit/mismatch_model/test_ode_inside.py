@@ -82,6 +82,7 @@ k = 30.0
         ("quadratic_drag", (6.0,), ()),
         ("amplitude_dependent_damping", (300.0,), ()),
         ("clearance", (200.0,), (0.02, 0.01)),
+        ("constant_load", (9.0,), ()),
         ("hysteresis", (1.0,), (0.05,)),
     ):
         moved = []

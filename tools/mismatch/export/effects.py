@@ -173,6 +173,14 @@ def _conduction(s: Slot, x: str, d: str) -> str:
     return f"conducted({x}, {s.at('knee')}, {s.at('width')}, {numbers(s.setting('side'))})"
 
 
+def _scale(s: Slot, x: str, d: str) -> str:
+    return f"(1 + {s.at('gain_error')}) * ({x})"
+
+
+def _zero(s: Slot, x: str, d: str) -> str:
+    return f"{x} + {s.at('load')}"
+
+
 def _quantization(s: Slot, x: str, d: str) -> str:
     if s.setting("step") <= 0:
         return x
@@ -414,6 +422,8 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "centripetal_acceleration": _centripetal,
     "sensor_position_error": _elsewhere,
     "channel_delay": _delay,
+    "constant_load": _zero,
+    "scale_error": _scale,
 }
 """Writers of the effects of a signal path. ``FORCES`` has those of forces inside an equation of motion."""
 
@@ -483,6 +493,10 @@ def _lever(s: Slot) -> ForceCode:
     return ForceCode(f" + {s.at('sine')} * np.sin(x) + {s.at('cosine')} * np.cos(x)")
 
 
+def _load(s: Slot) -> ForceCode:
+    return ForceCode(f" + {s.at('load')}")
+
+
 def _force_memory(s: Slot) -> ForceCode:
     if "yield_distance" in s.values:
         return _friction(s)
@@ -499,6 +513,7 @@ FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
     "quadratic_drag": _drag,
     "amplitude_dependent_damping": _amplitude_damping,
     "clearance": _clearance,
+    "constant_load": _load,
 }
 
 

@@ -37,7 +37,7 @@ from tools.guest.equations import (
     TANH,
     Program,
 )  # fmt: skip
-from tools.mismatch.export.effects import ForceCode, Slot, force, joined, numbers
+from tools.mismatch.export.effects import FORCES, ForceCode, Slot, force, joined, numbers
 from tools.mismatch.export.motion import bend_code, sum_code
 from tools.mismatch.twins.equations import Place, Programs
 from tools.mismatch.twins.ode import OdeTwin
@@ -204,6 +204,8 @@ class EquationLines:
         name = one.slot.placed.effect.name
         if one.place.kind not in ("storage", "storages"):
             return []
+        if name in FORCES:
+            return [f"rates[{one.place.target}] +={force(one.slot).smooth.removeprefix(' +')}"]
         lines: list[str] = []
         settings = one.slot.placed.settings
         names = level_names("empty_level" if name == "square_root_outflow" else "level", settings)

@@ -1,0 +1,33 @@
+"""A gain that is wrong: of a sensor, an amplifier or an actuator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (Human("gain", 1.0 + float(p[0]), "1"), Human("gain_error", float(p[0]), "1"))
+
+
+def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return x[:, None]
+
+
+SCALE_ERROR = Effect(
+    name="scale_error",
+    summary="the gain of a sensor, an amplifier or an actuator is another",
+    kind="add",
+    stages=("sensor", "amplifier", "actuator"),
+    parts=lambda settings: Parts((), (Parameter("gain_error", "1"),)),
+    equation=r"y = (1 + g)\, x",
+    source="IEEE Std 1293-2018, section on the model equation: scale factor error",
+    excitation="amplitudes at which the simulation is not linear, or a gain that is known in the simulation",
+    confusable_with=("static_nonlinearity", "saturation"),
+    basis=_basis,
+    report=_report,
+    vanishes_with=(("gain_error",),),
+    proportional=True,
+    shifts_line=True,
+)
