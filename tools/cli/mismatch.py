@@ -256,7 +256,8 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
         for one in made.guess.unknown:
             console().print(f"  {one}", soft_wrap=True)
         return
-    console().print(f"next: micron mismatch diagnose {shlex.quote(str(made.path))}", soft_wrap=True)
+    path = shlex.quote(str(made.path))
+    console().print(f"next: write what you know into {path}, then: micron mismatch diagnose {path}", soft_wrap=True)
 
 
 def physics(json_file: JsonOption = None) -> None:

@@ -57,7 +57,9 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
     try:
         model, theta = restore(with_effects)
     except RecordingError as error:
-        raise InputError(f"the report does not fit the recording: {error}; diagnose the recording again") from error
+        raise InputError(
+            f"the report does not fit the recording: {error}; check [twin.parameters] and diagnose the recording again"
+        ) from error
     theta = _same_weight(recording, report, model, theta)
     table = describe(model, theta)
     head = (

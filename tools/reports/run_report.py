@@ -200,10 +200,10 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
 
 def next_steps(result: Mapping[str, Any]) -> list[str]:
     """Commands that make sense after this run."""
-    replay = result["recording"] or "out/first.mcap"
+    replay = result["recording"] or "first.mcap"
     steps = ["micron bench                           the live page of the instrument"]
     if not result["recording"]:
-        steps.append("micron run --record out/first.mcap     record a run")
+        steps.append("micron run --record first.mcap         record a run")
     steps.append(f"micron replay {replay:<24} run it again, bit for bit")
     steps.append("micron mismatch --help                 what a simulation lacks")
     return ["next:", *(f"  {step}" for step in steps)]

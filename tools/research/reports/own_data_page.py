@@ -49,7 +49,8 @@ table[:, 2] += np.random.default_rng(1).normal(0, 0.02, t.size)
 np.savetxt("data.csv", table, delimiter=",", header="t_s,force_N,x_mm", comments="")
 ```
 
-The five commands:
+The five commands. Between the first and the second write what you know into `recording.toml` (section 1 has the lines
+for this example). Without it the mass that the regression finds here is negative, and `apply` refuses it.
 
 ``` { .bash title="five commands" }
 micron mismatch new data.csv
