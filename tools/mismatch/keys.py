@@ -70,12 +70,6 @@ HOLD = Key(
     "between samples the input runs straight, is held, or has nothing above half the rate; or a table by input",
     "inferred, else linear",
 )
-OFFSETS_OF_EACH = Key(
-    "offsets",
-    "table of numbers",
-    "what each output shows at zero; re-fitted, as OUTPUT_offset",
-    "0",
-)
 HOLD_OF_EACH = Key(
     "hold", "linear, zero", "between samples the inputs run straight or are held; or a table by input", HOLD.default
 )
@@ -149,7 +143,12 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
                 "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
             ),
             Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
-            OFFSETS_OF_EACH,
+            Key(
+                "offsets",
+                "table of numbers",
+                "what each output shows at zero; re-fitted, unless fixed lists OUTPUT_offset",
+                "0",
+            ),
             Key(
                 "function",
                 "file.py:name",
@@ -170,7 +169,6 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
         "fmu": (
             Key("path", "file name", "the FMU beside the recording: co-simulation (FMI 2, 3), model exchange (2)"),
             HOLD_OR_STRAIGHT,
-            OFFSETS_OF_EACH,
             Key("any parameter of the FMU", "number", "your value; may be re-fitted", "the FMU's"),
         ),
     }

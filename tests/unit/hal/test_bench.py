@@ -67,7 +67,7 @@ def test_refusals_name_file_and_key(tmp_path: Path, old: str, new: str, words: l
 
 
 def test_missing_file_says_what_to_do(tmp_path: Path):
-    with pytest.raises(BenchError, match=r"cannot be read.*--bench"):
+    with pytest.raises(BenchError, match=r"cannot be read.*name an existing bench file"):
         load_bench(tmp_path / "none.toml")
 
 

@@ -113,7 +113,7 @@ def test_an_fmu_that_refuses_half_steps_gets_the_mean_over_whole_ones(fmu: Path)
 def test_runs_with_its_parameters_and_from_its_own_start(fmu: Path) -> None:
     rec = of(fmu, hold="zero")
     model = Model(make(rec))
-    assert [p.name for p in model.parameters] == ["um_per_W", "time_constant_s", "position_offset"]
+    assert [p.name for p in model.parameters] == ["um_per_W", "time_constant_s"]
     for gain, tau in ((2.0, 0.5), (3.0, 0.5), (2.0, 0.1), (2.0, 0.5)):
         got = model.simulate(View.whole(rec), np.array([gain, tau]))["position"]
         np.testing.assert_allclose(got, truth(gain, tau), atol=1e-12)

@@ -21,10 +21,9 @@ from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, common_hold, read_holds
-from tools.mismatch.twins.offsets import OFFSETS
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
 
-OWN_KEYS = ("path", "hold", OFFSETS)
+OWN_KEYS = ("path", "hold")
 """Keys of ``[twin.parameters]`` that are not parameters of the FMU."""
 MOST_BYTES, MOST_FILES = 1 << 30, 10_000
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,9 @@ from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, 
 from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.ode_run import Drive
-from tools.mismatch.twins.offsets import OFFSETS, offset_name, offset_scale, read_offsets
 from tools.mismatch.twins.program import parse
 
-TABLES = ("states", "equations", "outputs", OFFSETS, "units", "function", "fixed", "hold")
+TABLES = ("states", "equations", "outputs", "offsets", "units", "function", "fixed", "hold")
 """Keys of an ode twin that are not numbers; they stand beside ``parameters`` in ``[twin]``, or inside it."""
 PROBES = 5
 
@@ -44,8 +44,7 @@ def ode_twin(recording: Recording) -> OdeTwin:
     for name in (*(s.name for s in states), *signals, *names):
         if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name) or name in ("t", "pi"):
             raise RecordingError(f"{where} '{name}' cannot be used in an equation; give it another name")
-    read = read_offsets(recording, {*(s.name for s in states), *signals, *names})
-    offsets = {offset_name(o): v for o, v in read.items()}
+    offsets = _offsets(where, recording, table, {*(s.name for s in states), *signals, *names})
     every = ("t", *(s.name for s in states), *signals, *names, *offsets)
     twice = {n for n in every if every.count(n) > 1}
     if twice:
@@ -55,6 +54,24 @@ def ode_twin(recording: Recording) -> OdeTwin:
     except EquationError as error:
         raise RecordingError(f"{where} {error}") from None
     return _assembled(recording, equations, states, signals, names, offsets)
+
+
+def _offsets(where: str, recording: Recording, table: Mapping[str, Any], others: Collection[str]) -> dict[str, float]:
+    """Return the offset of every output, by its name as a parameter; none where one of ``others`` has it.
+
+    A sensor's zero is no physics that is missing: without it a constant would be named as a step or a curve. An
+    engineer who has a parameter of that name has it in the equations.
+    """
+    own = [o for o in recording.outputs if offset_name(o) not in others]
+    given = table.get("offsets", {})
+    if not isinstance(given, Mapping) or any(o not in own or not _number(v) for o, v in given.items()):
+        raise RecordingError(f"{where} offsets must give a number for an output ({', '.join(own)}), got {given!r}")
+    return {offset_name(o): float(given.get(o, 0.0)) for o in own}
+
+
+def offset_name(output: str) -> str:
+    """Return the name of the offset of an output among the parameters."""
+    return f"{output}_offset"
 
 
 def _assembled(
@@ -80,8 +97,9 @@ def _assembled(
     free = tuple(i for i, n in enumerate(names) if n not in fixed)
     values = np.array([numbers[n] for n in names])
     scale = {n: 0.01 * abs(v) or 1e-3 for n, v in numbers.items()}
+    # small beside those of the engineer's own numbers: a constant that one of these makes as well is left to it
     offset_of = {offset_name(o): o for o in recording.outputs if offset_name(o) in offsets}
-    scale |= {n: offset_scale(recording, o) for n, o in offset_of.items()}
+    scale |= {n: 1e-4 * float(np.ptp(recording.outputs[o])) or 1e-3 for n, o in offset_of.items()}
     u = np.column_stack([recording.signals[s] for s in signals])
     x = _as_given(recording, equations, states, u, values, held)
     typical = _typical(x, states)
@@ -99,8 +117,8 @@ def _assembled(
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
         moved = {o: found.get(n, offsets[n]) for n, o in offset_of.items()}
-        beside = {OFFSETS: {o: v for o, v in moved.items() if v}} if any(moved.values()) else {}
-        return {**{k: found.get(k, v) for k, v in table.items() if k != OFFSETS}, **beside}
+        beside = {"offsets": {o: v for o, v in moved.items() if v}} if any(moved.values()) else {}
+        return {**{k: found.get(k, v) for k, v in table.items() if k != "offsets"}, **beside}
 
     integrates = bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN)
     return OdeTwin(

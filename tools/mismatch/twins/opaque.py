@@ -23,7 +23,6 @@ from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import Hold
 from tools.mismatch.twins.memo import remember
-from tools.mismatch.twins.offsets import OFFSETS, offset_name, offset_scale, read_offsets
 
 
 class UserTwin(Protocol):
@@ -60,15 +59,12 @@ class OpaqueTwin:
     feedback_on: str = ""
     counted: Counted = ""
     source: str = field(default="", compare=False)
-    offsets: Mapping[str, float] = field(default_factory=dict[str, float])
-    """What each output shows at zero, by the output, as given; a base parameter is ``offset_name`` of it."""
     holds: Holds = field(default_factory=dict[str, Hold])
     """Hold of the inputs, the same for each, that the program is told; empty: it is not told."""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
-        zeros = {offset_name(o): v for o, v in self.offsets.items()}
-        return np.array([float(zeros[k] if k in zeros else self.given[k]) for k in self.free])
+        return np.array([float(self.given[k]) for k in self.free])
 
     def drive(self, output: str) -> str:
         """See Twin."""
@@ -95,12 +91,10 @@ class OpaqueTwin:
     ) -> dict[str, Signal]:
         """See Twin."""
         used = {s: fold(x, theta) for s, x in inputs.items()}
-        found = dict(zip(self.free, (float(v) for v in theta), strict=False))
-        zeros = {o: found.pop(offset_name(o), v) for o, v in self.offsets.items()}
-        values = {k: v for k, v in self.given.items() if k != OFFSETS} | found
-        key = ("opaque", tuple(x.token for x in used.values()), tuple(found.values()))
+        values = dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=False)}
+        key = ("opaque", tuple(x.token for x in used.values()), tuple(values[k] for k in self.free))
 
-        as_given = all(v == float(self.given[k]) for k, v in found.items())
+        as_given = all(values[k] == float(self.given[k]) for k in self.free)
 
         def make() -> Array:
             try:
@@ -112,10 +106,7 @@ class OpaqueTwin:
                 return np.full((len(self.outputs), run.t.size), np.nan)
 
         stacked = remember(run.memo, key, make)
-        return {
-            o: Signal(stacked[i] + zeros.get(o, 0.0), {}, (key, o, zeros.get(o, 0.0)))
-            for i, o in enumerate(self.outputs)
-        }
+        return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
 
     def _checked(self, found: Mapping[str, Array], t: Array) -> Array:
         """Return outputs (outputs, n). Raises RecordingError if one is missing, not finite or not as long as ``t``."""
@@ -136,28 +127,21 @@ class OpaqueTwin:
 
     def human(self, theta: Array) -> Sequence[Human]:
         """See Twin."""
-        units = {offset_name(o): self.units[o] for o in self.offsets}
-        return [Human(k, float(v), units.get(k, "")) for k, v in zip(self.free, theta, strict=True)]
+        return [Human(k, float(v), "") for k, v in zip(self.free, theta, strict=True)]
 
     def to_text(self, theta: Array) -> dict[str, object]:
         """See Twin."""
-        found = dict(zip(self.free, (float(v) for v in theta), strict=True))
-        zeros = {o: found.pop(offset_name(o), v) for o, v in self.offsets.items()}
-        kept: dict[str, object] = {k: v for k, v in self.given.items() if k != OFFSETS}
-        return kept | found | ({OFFSETS: {o: v for o, v in zeros.items() if v}} if any(zeros.values()) else {})
+        out: dict[str, object] = dict(self.given)
+        return out | {k: float(v) for k, v in zip(self.free, theta, strict=True)}
 
 
 def opaque_twin(recording: Recording, call: Call, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:
-    """Return a program as a twin. All numbers in ``[twin.parameters]`` and the offset of each output may be re-fitted,
-    but for the names in ``fixed``."""
+    """Return the numbers in ``[twin.parameters]`` that may be re-fitted: all but the names in ``fixed``."""
     given = recording.twin.parameters
-    own = tuple(k for k, v in given.items() if isinstance(v, int | float) and not isinstance(v, bool))
-    offsets = read_offsets(recording, own)
-    scale = {k: 0.01 * abs(float(given[k])) or 1e-3 for k in own}
-    scale |= {offset_name(o): offset_scale(recording, o) for o in offsets}
-    free = tuple(k for k in scale if k not in fixed)
-    unit = {offset_name(o): recording.unit[o] for o in offsets}
-    parameters = tuple(Parameter(k, unit.get(k, ""), scale=scale[k]) for k in free)
+    free = tuple(
+        k for k, v in given.items() if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed
+    )
+    parameters = tuple(Parameter(k, "", scale=0.01 * abs(float(given[k])) or 1e-3) for k in free)
     return OpaqueTwin(
         recording.twin.kind,
         tuple(recording.inputs),
@@ -168,7 +152,6 @@ def opaque_twin(recording: Recording, call: Call, source: str, fixed: Sequence[s
         given,
         parameters,
         source=source,
-        offsets=offsets,
     )
 
 
