@@ -9,6 +9,11 @@ import numpy as np
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import SPRING
 
+SOURCE = (
+    "A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System"
+    " Identification Benchmarks (2019), eq. 1 (the offset)"
+)
+
 
 def _fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     row = np.zeros(SPRING)
@@ -32,8 +37,7 @@ AT_INPUT = Effect(
     sites=("input",),
     parts=lambda settings: Parts((), (Parameter("load", "{in}"),)),
     equation=r"u' = u + u_0",
-    source="A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System"
-    " Identification Benchmarks (2019), eq. 1 (the offset)",
+    source=SOURCE,
     excitation="motion both ways, without anything that holds the position",
     basis=_basis,
     report=_report,
@@ -48,8 +52,7 @@ CONSTANT_LOAD = Effect(
     stages=("mechanics", "actuator"),
     parts=lambda settings: Parts((), (Parameter("load", "{out}/s^2"),)),
     equation=r"m\ddot x + c\dot x + k x = F + F_0",
-    source="A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System"
-    " Identification Benchmarks (2019), eq. 1 (the offset)",
+    source=SOURCE,
     excitation="motion both ways, without anything that holds the position",
     confusable_with=("coulomb_friction", "thermal_drift", "step_shift"),
     basis=_basis,

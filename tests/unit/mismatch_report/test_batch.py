@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.unit.clusters import local_cluster
 from tests.unit.mismatch_report.canned import missing_physics
 from tests.unit.mismatch_report.systems import recording
 from tools.errors import InputError
@@ -99,16 +100,8 @@ def dies_first(job: Job) -> Row:
 
 @pytest.mark.slow
 def test_a_dask_cluster_of_two_survives_a_killed_worker(tmp_path: Path):
-    distributed = pytest.importorskip("distributed")
     jobs = [Job(f"r{i}", tmp_path, None, 0.3, 0) for i in range(6)]
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address="127.0.0.1:0",
-        host="127.0.0.1",
-        silence_logs=50,
-    ) as cluster:
+    with local_cluster(2) as cluster:
         rows = list(batch.run_on_dask(jobs, cluster.scheduler_address, dies_first))
     killed = (tmp_path / "killed").read_text()
     assert sorted(r.name for r in rows) == [f"r{i}" for i in range(6)]

@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hal.children import begin_as_worker
+from tests.unit.clusters import local_cluster
 from tests.unit.mismatch_together.test_together import refused, write
 from tools.cli.main import app
 
@@ -33,14 +34,7 @@ def test_a_cluster_gives_the_answer_of_one_process(tmp_path: Path, monkeypatch: 
         write(runs / f"day{k}", k, play=0.0015, n=600)
     here = diagnosed(runs, tmp_path / "here.json", "--jobs", "1")
     monkeypatch.setattr("tools.mismatch.engine.workers.LEAST_WORK", 0)
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address="127.0.0.1:0",
-        host="127.0.0.1",
-        silence_logs=50,
-    ) as cluster:
+    with local_cluster(2) as cluster:
         there = diagnosed(runs, tmp_path / "there.json", "--dask", cluster.scheduler_address)
         with distributed.Client(cluster, set_as_default=False) as client:
             finished = client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.transition_counter)
@@ -50,12 +44,9 @@ def test_a_cluster_gives_the_answer_of_one_process(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.slow
 def test_a_cluster_without_workers_is_one_message(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
     for k in range(2):
         write(tmp_path / f"day{k}", k, n=100)
-    with distributed.LocalCluster(
-        n_workers=0, dashboard_address="127.0.0.1:0", host="127.0.0.1", silence_logs=50
-    ) as cluster:
+    with local_cluster(0) as cluster:
         output = refused(tmp_path, "--together", "--dask", cluster.scheduler_address)
     assert "the scheduler has no workers; start one: dask worker" in output
 
