@@ -125,11 +125,12 @@ def _diagnose_together(joined: Recording, held_out: float, seed: int, jobs: int,
 def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, *, here: bool = True) -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from tools.mismatch.engine.checks import questions
     from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
     loaded = load(recording) if isinstance(recording, Path) else recording
-    for note in loaded.warnings:
+    for note in (*loaded.warnings, *([] if loaded.parts else questions(loaded))):
         print_note(note)
     with Progress(
         task_name(), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),

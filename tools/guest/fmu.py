@@ -1,5 +1,4 @@
-"""Runs an FMU in the process of a guest, through FMPy (an extra): co-simulation (FMI 2, 3) or model exchange (FMI
-2)."""
+"""Runs an FMU in the process of a guest, through FMPy (an extra): co-simulation (FMI 2, 3), model exchange (FMI 2)."""
 
 from __future__ import annotations
 
@@ -20,6 +19,11 @@ from tools.guest.fmu_linear import linear_equations
 Array = NDArray[np.float64]
 
 
+RK_ERROR = 1e-6
+"""Largest change of an output, as a share of its range, by which half the step may differ."""
+MOST_RK_STEPS = 64
+
+
 class FmuError(ValueError):
     """The FMU cannot be opened, or stopped in a run."""
 
@@ -35,6 +39,7 @@ class OpenFmu:
 
     def __init__(self, path: Path, digest: str, outputs: tuple[str, ...], dt: float) -> None:
         self.outputs, self.dt = outputs, dt
+        self.rk_steps = 0  # steps from sample to sample of a model exchange; 0 until a first run
         self.parts = 2  # communication steps from sample to sample when inputs are linear
         data = path.read_bytes()
         if hashlib.sha256(data).hexdigest() != digest:
@@ -79,6 +84,9 @@ class OpenFmu:
         kind = {v.name: v.type for v in self.description.modelVariables}
         read = _signals(inputs)
         plain = all(kind.get(name) == "Real" for name in (*read, *self.outputs, *start))
+        if self.kind == "ModelExchange":
+            self.instance.reset()
+            return self.integrated(inputs, start, hold)
         run = self.stepped if plain and str(self.description.fmiVersion).startswith("2") else self.simulated
         try:
             self.instance.reset()
@@ -130,6 +138,88 @@ class OpenFmu:
                     # an output that its input reaches at once is read at the instant of the sample
                     sent[:] = rows[k + 1]
                     fmu.fmi2SetReal(c, to, n_in, sent)
+        return {o: found[:, i] for i, o in enumerate(self.outputs)}
+
+    def integrated(self, inputs: Mapping[str, Array], start: Mapping[str, Any], hold: str) -> dict[str, Array]:
+        """Integrate an FMU for model exchange; the first run finds the steps per sample that its equations need.
+
+        FMPy's own integration holds continuous inputs over a step and looks through all events at each step.
+        """
+        self.check_integrable(inputs, start)
+        try:
+            if self.rk_steps:
+                return self.rk4(inputs, start, hold, self.rk_steps)
+            found, n = self.rk4(inputs, start, hold, 1), 1
+            while n < MOST_RK_STEPS:
+                self.instance.reset()
+                finer, n = self.rk4(inputs, start, hold, 2 * n), 2 * n
+                off = max(
+                    float(np.max(np.abs(finer[o] - found[o]))) / max(float(np.ptp(finer[o])), 1e-300) for o in found
+                )
+                if off < RK_ERROR:
+                    self.rk_steps = n
+                    return finer
+                found = finer
+        except Exception as error:
+            raise FmuError(f"the FMU stopped ({_line(error)})") from error
+        raise FmuError(
+            f"its equations need more than {MOST_RK_STEPS} steps from sample to sample: export for co-simulation"
+        )
+
+    def check_integrable(self, inputs: Mapping[str, Array], start: Mapping[str, Any]) -> None:
+        """Raise FmuError for events and for variables that are not real."""
+        kind = {v.name: v.type for v in self.description.modelVariables}
+        if self.description.numberOfEventIndicators:
+            raise FmuError(
+                "it is for model exchange and has events, which are not searched for: export for co-simulation"
+            )
+        other = [s for s in (*_signals(inputs), *self.outputs, *start) if kind.get(s) != "Real"]
+        if other:
+            raise FmuError(f"it is for model exchange, and {other[0]} is not a real variable: export for co-simulation")
+
+    def rk4(self, inputs: Mapping[str, Array], start: Mapping[str, Any], hold: str, steps: int) -> dict[str, Array]:
+        """Integrate by the classical method of Runge and Kutta (Hairer, Norsett, Wanner 1993, table II.1.2).
+
+        ``steps``: number from sample to sample, over which inputs run straight ("linear") or are held.
+        """
+        fmu, signals = self.instance, _signals(inputs)
+        number = {v.name: int(v.valueReference) for v in self.description.modelVariables}
+        fmu.setupExperiment(startTime=float(inputs["t"][0]))
+        fmu.setReal([number[k] for k in start], [float(v) for v in start.values()])
+        to, of = [number[s] for s in signals], [number[o] for o in self.outputs]
+        u = np.column_stack([inputs[s] for s in signals])
+        fmu.enterInitializationMode()
+        fmu.setReal(to, u[0].tolist())
+        fmu.exitInitializationMode()
+        while fmu.newDiscreteStates()[0]:
+            pass
+        fmu.enterContinuousTimeMode()
+        n_x = int(self.description.numberOfContinuousStates)
+        at, rates = (ctypes.c_double * n_x)(), (ctypes.c_double * n_x)()
+        fmu.getContinuousStates(at, n_x)
+        x, h = np.array(at), self.dt / steps
+        found = np.empty((u.shape[0], len(of)))
+
+        def slope(t: float, y: Array, v: Array) -> Array:
+            fmu.setTime(t)
+            at[:] = y.tolist()
+            fmu.setContinuousStates(at, n_x)
+            fmu.setReal(to, v.tolist())
+            fmu.getDerivatives(rates, n_x)
+            return np.array(rates)
+
+        with np.errstate(all="ignore"):
+            for k, t in enumerate(inputs["t"].tolist()):
+                slope(t, x, u[k])
+                found[k] = fmu.getReal(of)
+                rise = (u[k + 1] - u[k]) / steps if hold == "linear" and k + 1 < len(u) else np.zeros(len(to))
+                for i in range(steps if k + 1 < len(u) else 0):
+                    now, begin = t + i * h, u[k] + i * rise
+                    k1 = slope(now, x, begin)
+                    k2 = slope(now + 0.5 * h, x + 0.5 * h * k1, begin + 0.5 * rise)
+                    k3 = slope(now + 0.5 * h, x + 0.5 * h * k2, begin + 0.5 * rise)
+                    k4 = slope(now + h, x + h * k3, begin + rise)
+                    x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         return {o: found[:, i] for i, o in enumerate(self.outputs)}
 
     def simulated(

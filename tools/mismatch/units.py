@@ -175,6 +175,29 @@ def same_dimension(a: str, b: str) -> bool:
     return parse(a).dimension == parse(b).dimension
 
 
+_USUAL = ("u", "m", "k", "M")
+"""Prefixes of units that a column may be in without a word about it."""
+
+
+def sizes_beside(unit: str) -> list[tuple[str, float]]:
+    """Return the units of the dimension of ``unit``, each with the value in it of one ``unit``.
+
+    Without a unit: the factors that columns are off by most often, with their words.
+    """
+    if not is_unit(unit) or parse(unit).dimension == _NONE:
+        words = {"a factor of 1000": 1e3, "a factor of 1e6": 1e6, "degrees or radians": 180 / math.pi}
+        words |= {"g or m/s^2": STANDARD_GRAVITY}
+        return [(w, f) for w, size in words.items() for f in (size, 1 / size)]
+    own = parse(unit)
+    out = [
+        (f"{prefix}{symbol}", own.factor / (factor * _PREFIXES.get(prefix, 1.0)))
+        for symbol, (dimension, factor, _, prefixed) in _SYMBOLS.items()
+        if dimension == own.dimension
+        for prefix in ("", *(_USUAL if prefixed else ()))
+    ]
+    return out + [(f"{f:g} {unit}", 1 / f) for f in (1e-3, 1e3, 1e-6, 1e6)]
+
+
 def convert(values: Array, unit: str, to: str) -> Array:
     """Convert values in ``unit`` to values in ``to``. Raises UnitError if the dimensions differ."""
     a, b = parse(unit), parse(to)

@@ -9,8 +9,8 @@ X = np.sin(2 * np.pi * 1.3 * T) + 0.4 * np.sin(2 * np.pi * 3.1 * T)
 Y = np.cos(2 * np.pi * 0.7 * T)
 
 
-def said(output: np.ndarray, simulated: np.ndarray) -> str:
-    return "; ".join(messages({"u": X}, {"y": output}, {}, {"y": simulated}, {"y": "u"}, 1e-3))
+def said(output: np.ndarray, simulated: np.ndarray, unit: str = "") -> str:
+    return "; ".join(messages({"u": X}, {"y": output}, {}, {"y": simulated}, {"y": "u"}, 1e-3, {"y": unit}))
 
 
 def test_nothing_to_say_about_a_good_match() -> None:
@@ -21,10 +21,21 @@ def test_nothing_to_say_about_a_good_match() -> None:
 def test_sign_unit_shift_and_silence() -> None:
     assert "opposite sign" in said(-X, X)
     assert "1000" in said(1000 * X, X)
-    assert "gravity" in said(9.81 * X, X)
+    assert "g or m/s^2" in said(9.81 * X, X)
     assert "degrees" in said(57.3 * X, X)
     assert "late" in said(np.roll(Y, 300), Y)
     assert "never changes" in said(np.zeros(4000), X)
+
+
+def test_the_unit_that_a_column_is_likely_in() -> None:
+    assert "is the column in deg, not in rad?" in said(57.3 * X, X, "rad")
+    assert "is the column in rad, not in deg?" in said(X / 57.3, X, "deg")
+    assert "is the column in rpm, not in rad/s?" in said(9.55 * X, X, "rad/s")
+    assert "is the column in mm, not in m?" in said(1000 * X, X, "m")
+    assert "is the column in kPa, not in bar?" in said(100 * X, X, "bar")
+    # a simulation that the output does not follow; then a gain that no unit has
+    assert "spreads 60 times as far" in said(60 * Y * np.std(X) / np.std(Y), X, "rad")
+    assert "column" not in said(2.0 * Y, X, "rad") + said(1.3 * X, X, "rad") + said(30 * X, X, "rad")
 
 
 def test_clipping_and_lag() -> None:

@@ -1,4 +1,4 @@
-"""FMUs for model exchange (built here with the C compiler): linear ones show their equations, others are refused."""
+"""FMUs for model exchange (built here with the C compiler): linear ones show their equations, others are integrated."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from hal.trust import trust_program
 from tools.errors import RecordingError
@@ -77,11 +79,41 @@ def rebuilt(folder: Path, out: Path, old: str, new: str) -> Path:
     return out / "fmu_me.toml"
 
 
-def test_equations_that_are_not_linear_are_refused(folder: Path, tmp_path: Path) -> None:
-    rate = "m->v[RATE_ANGLE] = m->v[SPEED];"
-    path = rebuilt(folder, tmp_path, rate, f"{rate} m->v[RATE_ANGLE] += 1e-6 * m->v[SPEED] * m->v[SPEED];")
-    with pytest.raises(RecordingError, match=r"motor_me.fmu: .* linear.* export this one for co-simulation"):
-        make(load(path))
+@pytest.mark.parametrize("hold", ["linear", "zero"])
+def test_equations_that_are_not_linear_are_integrated(folder: Path, tmp_path: Path, hold: str) -> None:
+    """FMPy runs them; the truth is scipy's integrator over the same equations, a sample at a time."""
+    pull = "- 40.0 * sin(m->v[ANGLE]) - m->v[SPEED]) /"
+    path = rebuilt(folder, tmp_path, "- m->v[SPEED]) /", pull)
+    path.write_text(path.read_text().replace("[twin.parameters]", f'[twin.parameters]\nhold = "{hold}"'))
+    recording = load(path)
+    assert with_equations(recording) is recording
+    assert "kind 'ode'" in not_tried(make(recording))
+    found = free_run(recording)["angle"]
+    u = recording.inputs["command"]
+    x, truth = np.zeros(2), [0.0]
+    for k in range(300):
+        line = (lambda s, k=k: u[k] + (u[k + 1] - u[k]) * s / recording.dt) if hold == "linear" else lambda s, k=k: u[k]
+
+        def rates(s: float, x: np.ndarray, line: Callable[[float], float] = line) -> list[float]:
+            return [x[1], (20.0 * line(s) - 40.0 * np.sin(x[0]) - x[1]) / 0.08]
+
+        x = solve_ivp(rates, (0.0, recording.dt), x, rtol=1e-10, atol=1e-12).y[:, -1]
+        truth.append(float(x[0]))
+    np.testing.assert_allclose(found[:301], truth, atol=1e-5 * np.ptp(truth))
+
+
+def test_events_are_refused(folder: Path, tmp_path: Path) -> None:
+    path = rebuilt(folder, tmp_path, "- m->v[SPEED]) /", "- 0.1 - m->v[SPEED]) /")
+    with zipfile.ZipFile(tmp_path / "motor_me.fmu") as was:
+        texts = {name: was.read(name) for name in was.namelist()}
+    described = texts["modelDescription.xml"].decode()
+    texts["modelDescription.xml"] = described.replace('EventIndicators="0"', 'EventIndicators="1"').encode()
+    with zipfile.ZipFile(tmp_path / "motor_me.fmu", "w") as archive:
+        for name, data in texts.items():
+            archive.writestr(name, data)
+    trust_program(tmp_path / "motor_me.fmu")
+    with pytest.raises(RecordingError, match=r"motor_me.fmu: .* events, .*: export for co-simulation"):
+        free_run(load(path))
 
 
 def test_a_linear_map_is_told_from_others() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.engine.checks import messages
+from tools.mismatch.engine.checks import first_look
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
@@ -41,7 +41,6 @@ from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio,
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.ode import inside_of
 
 Array = NDArray[np.float64]
@@ -178,7 +177,7 @@ def assemble(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),
             all(ljung_box(fitted.residual[o][rows]) > 0.01 for o in twin.outputs),
             decision.p_value,
-            tuple(gross(posed)),
+            tuple(first_look(posed.recording, posed.raw.model, posed.raw.theta)),
             memory_p,
         ),
         seconds=0.0,
@@ -231,16 +230,6 @@ def conclude(
         named = ended.fitted if report.physics else ended.base
         report = replace(report, together=compare_recordings(posed.problem, ended.base, named, jobs))
     return report
-
-
-def gross(posed: Posed) -> list[str]:
-    """Return the messages of the cheap checks, on the simulation as given."""
-    recording, twin, raw = posed.recording, posed.problem.twin, posed.raw
-    whole = View.whole(recording)
-    with np.errstate(all="ignore"):
-        simulated = raw.model.simulate(whole, raw.theta)
-    drives = {o: twin.drive(o) for o in twin.outputs}
-    return messages(recording.inputs, recording.outputs, recording.context, simulated, drives, recording.dt)
 
 
 def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[DependsOn]) -> list[DependsOn]:

@@ -10,19 +10,20 @@ from scipy.optimize import linear_sum_assignment
 from scipy.signal import correlate
 
 from tools.mismatch.engine.noise import lattice_step
+from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.fmu import with_equations
+from tools.mismatch.twins.make import make
+from tools.mismatch.units import sizes_beside
 
 Array = NDArray[np.float64]
 
-FACTORS = {
-    1e3: "a factor 1000 (milli or kilo)",
-    1e-3: "a factor 1000 (milli or kilo)",
-    1e6: "a factor 1e6 (micro)",
-    1e-6: "a factor 1e6 (micro)",
-    9.80665: "standard gravity (g or m/s^2)",
-    1 / 9.80665: "standard gravity (g or m/s^2)",
-    180 / np.pi: "degrees or radians",
-    np.pi / 180: "degrees or radians",
-}
+ALIKE = 1.06
+"""Factor within which the slope of an output that follows its simulation counts as that of a unit."""
+APART, NEAR = 5.0, 1.5
+"""Least ratio of the spreads of an output and a simulation that it does not follow above which a unit may be wrong, and
+the factor within which it counts as that of a unit. Wrong parameters change a spread by less."""
 
 
 def constant_channels(signals: Mapping[str, Array]) -> list[str]:
@@ -70,6 +71,19 @@ def gross_scale(y: Array, simulated: Array) -> tuple[float, float]:
     return (both / power if power > 0 else np.nan), (both / size if size > 0 else 0.0)
 
 
+def likely_unit(unit: str, ratio: float, within: float) -> str:
+    """Return what a column in ``unit`` would be in if its values are ``ratio`` times too large, "" without an answer.
+
+    ``within``: factor by which the ratio may differ from that of the two units.
+    """
+    found, least = "", within
+    for other, factor in sizes_beside(unit):
+        off = max(ratio / factor, factor / ratio) if ratio > 0 else np.inf
+        if max(factor, 1 / factor) > ALIKE * ALIKE and off < least:
+            found, least = other, off
+    return f"is the column in {found}, not in {unit}" if unit and found else found
+
+
 def messages(
     inputs: Mapping[str, Array],
     outputs: Mapping[str, Array],
@@ -77,8 +91,13 @@ def messages(
     simulated: Mapping[str, Array],
     drives: Mapping[str, str],
     dt: float,
+    units: Mapping[str, str] | None = None,
 ) -> list[str]:
-    """Return messages on faults of the recording that are not physics. ``simulated``: the twin as given (n,)."""
+    """Return messages on faults of the recording that are not physics. ``simulated``: the twin as given (n,).
+
+    ``units``: the unit of each output in its file.
+    """
+    units = units or {}
     out: list[str] = []
     for s in constant_channels({**inputs, **outputs, **context}):
         out.append(f"{s} never changes: is it connected?")
@@ -91,16 +110,19 @@ def messages(
             out.append(f"{o} repeats its last value {held} times: a logger that lost samples?")
         slope, rho = gross_scale(y, simulated[o])
         if abs(rho) < 0.7 or not np.isfinite(slope):
+            still = float(np.std(simulated[o]))
+            ratio = float(np.std(y)) / still if still > 0 and np.isfinite(still) else 1.0
+            unit = likely_unit(units.get(o, ""), ratio, NEAR) if max(ratio, 1 / max(ratio, 1e-300)) > APART else ""
+            if unit:
+                out.append(f"{o} spreads {ratio:.3g} times as far as the simulation: {unit}?")
             shift = lag_samples(y, simulated[o], min(y.size // 4, round(2.0 / dt) + 10))
             if abs(rho) < 0.5 and shift != 0:
                 out.append(f"{o} matches the simulation best {shift * dt:.4g} s late: do both clocks start together?")
             continue
         if slope < 0:
             out.append(f"{o} has the opposite sign of the simulation")
-        for factor, words in FACTORS.items():
-            if abs(abs(slope) / factor - 1) < 0.06:
-                out.append(f"{o} is {abs(slope):.4g} times the simulation: {words}?")
-                break
+        if unit := likely_unit(units.get(o, ""), abs(slope), ALIKE):
+            out.append(f"{o} is {abs(slope):.4g} times the simulation: {unit}?")
     if len(outputs) > 1 and all(drives.get(o) in inputs for o in outputs):
         names, sources = list(outputs), [drives[o] for o in outputs]
         if len(set(sources)) == len(sources):
@@ -112,3 +134,22 @@ def messages(
                 pairs = ", ".join(f"{names[i]} follows {sources[j]}" for i, j in moved)
                 out.append(f"axes look swapped: {pairs}")
     return out
+
+
+def first_look(recording: Recording, model: Model, theta: Array) -> list[str]:
+    """Return the messages of ``messages`` on a recording beside the simulation at ``theta``."""
+    r, twin = recording, model.twin
+    with np.errstate(all="ignore"):
+        simulated = model.simulate(View.whole(r), theta)
+    drives = {o: twin.drive(o) for o in twin.outputs}
+    return messages(r.inputs, r.outputs, r.context, simulated, drives, r.dt, r.file_unit)
+
+
+def questions(recording: Recording) -> list[str]:
+    """Return the messages on a recording beside its twin as given, before a search that may take minutes.
+
+    Raises RecordingError if the twin cannot be made.
+    """
+    recording = with_equations(recording)
+    model = Model(make(recording))
+    return first_look(recording, model, model.start(recording))

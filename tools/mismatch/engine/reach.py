@@ -29,10 +29,10 @@ def not_tried(twin: Twin) -> str:
     if not isinstance(core, OpaqueTwin):
         return ""
     what = {
-        "fmu": "An FMU for co-simulation shows its inputs and outputs alone",
+        "fmu": "An FMU shows its inputs and outputs alone",
         "instrument": "The emulated bench shows its inputs and outputs alone",
     }.get(core.kind, "A twin in Python shows its inputs and outputs alone")
-    more = " So does an FMU for model exchange with linear equations." if core.kind == "fmu" else ""
+    more = " So does an FMU for model exchange (FMI 2) if its equations are linear." if core.kind == "fmu" else ""
     return (
         f"{what}: {_INSIDE}. A twin of kind 'ode' (the equations as text or a function of derivatives) allows it.{more}"
     )

@@ -1,6 +1,7 @@
 """Uses an FMU as a twin: co-simulation (FMI 2, 3) or model exchange (FMI 2).
 
-The FMU runs in a process of its own (``tools.guest``). A linear FMU for model exchange becomes a state-space twin.
+The FMU runs in a process of its own (``tools.guest``). An FMU for model exchange (FMI 2) whose equations are linear
+becomes a state-space twin; any other one is an opaque program.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
 
 
 def fmu_twin(recording: Recording) -> OpaqueTwin:
-    """Return an FMU for co-simulation as an opaque program."""
+    """Return an FMU as an opaque program."""
     path, run = opened_fmu(recording)
     twin = opaque_twin(recording, run, str(path), fixed=OWN_KEYS)
     hold = common_hold(recording)
@@ -131,21 +132,18 @@ def fmu_twin(recording: Recording) -> OpaqueTwin:
 
 
 def with_equations(recording: Recording) -> Recording:
-    """Return the recording with the state space of an FMU for model exchange, so that forces reach each of its states.
+    """Return the recording with the state space of a linear FMU for model exchange: forces reach each of its states.
 
-    Any other recording is returned unchanged. Raises RecordingError if the equations are not linear.
+    Any other recording is returned unchanged.
     """
     if recording.twin.kind != "fmu":
         return recording
-    path, run = opened_fmu(recording)
+    _, run = opened_fmu(recording)
     if run.kind() == "CoSimulation":
         return recording
     found = run.linear()
     if found is None:
-        raise RecordingError(
-            f"{path}: an FMU for model exchange is read when its equations are linear, without constant terms, time and"
-            " events; export this one for co-simulation, or write its equations as a twin of kind 'ode'"
-        )
+        return recording
     parameters = dict(found) if any(found["x0"]) else {k: v for k, v in found.items() if k != "x0"}
     parameters |= {k: v for k, v in recording.twin.parameters.items() if k == "hold"}
     return replace(recording, twin=replace(recording.twin, kind="state_space", parameters=parameters))
