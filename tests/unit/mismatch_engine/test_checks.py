@@ -10,7 +10,7 @@ Y = np.cos(2 * np.pi * 0.7 * T)
 
 
 def said(output: np.ndarray, simulated: np.ndarray, unit: str = "") -> str:
-    return "; ".join(messages({"u": X}, {"y": output}, {}, {"y": simulated}, {"y": "u"}, 1e-3, {"y": unit}))
+    return "; ".join(messages({"u": X}, {"y": output}, {}, {"y": simulated}, {"y": "u"}, 1e-3, units={"y": unit}))
 
 
 def test_nothing_to_say_about_a_good_match() -> None:

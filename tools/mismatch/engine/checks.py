@@ -91,6 +91,7 @@ def messages(
     simulated: Mapping[str, Array],
     drives: Mapping[str, str],
     dt: float,
+    *,
     units: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Return messages on faults of the recording that are not physics. ``simulated``: the twin as given (n,).
@@ -142,7 +143,7 @@ def first_look(recording: Recording, model: Model, theta: Array) -> list[str]:
     with np.errstate(all="ignore"):
         simulated = model.simulate(View.whole(r), theta)
     drives = {o: twin.drive(o) for o in twin.outputs}
-    return messages(r.inputs, r.outputs, r.context, simulated, drives, r.dt, r.file_unit)
+    return messages(r.inputs, r.outputs, r.context, simulated, drives, r.dt, units=r.file_unit)
 
 
 def questions(recording: Recording) -> list[str]:
