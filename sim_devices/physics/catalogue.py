@@ -25,7 +25,7 @@ from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
 from sim_devices.physics.load import CONSTANT_LOAD
-from sim_devices.physics.parameter import PARAMETER_VARIATION
+from sim_devices.physics.parameter import DIRECTION_DEPENDENCE, PARAMETER_VARIATION
 from sim_devices.physics.quantization import QUANTIZATION
 from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
@@ -82,6 +82,7 @@ _ALL = (
     SQUARE_ROOT_OUTFLOW,
     OVERFLOW,
     PARAMETER_VARIATION,
+    DIRECTION_DEPENDENCE,
     ONE_SIDED_CONDUCTION,
     CONSTANT_LOAD,
     SCALE_ERROR,

@@ -1,4 +1,4 @@
-"""A parameter of differential equations that is no constant: it follows a recorded signal."""
+"""Parameters of differential equations that are no constants: they follow a recorded signal, or a direction."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     parameter, signal = settings[PAIRS]
-    return {"sway": np.array([parameter, signal, w[0], settings["centre"][0]])}
+    return {"sway": np.array([parameter, signal, w[0], settings["centre"][0], 0.0])}
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -52,4 +52,49 @@ PARAMETER_VARIATION = Effect(
     fill=_fill,
     report=_report,
     acts_on=("parameter",),
+)
+
+
+def _turned_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0))}
+
+
+def _turned_parts(settings: Settings) -> Parts:
+    return Parts((), (Parameter("relative_change", "1", scale=0.03),))
+
+
+def _turned_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.sign(np.gradient(x, ctx.dt))[:, None]
+
+
+def _turned_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    parameter, state = settings[PAIRS]
+    return {"sway": np.array([parameter, state, w[0], 0.0, 1.0])}
+
+
+def _turned_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    a = float(np.clip(p[0], -MOST_TURNED, MOST_TURNED))
+    return (Human("relative_change", float(p[0]), "1"), Human("rising_to_falling", (1 + a) / (1 - a), "1"))
+
+
+MOST_TURNED = 0.95
+"""Largest relative change by direction; at 1 the parameter would vanish one way."""
+
+DIRECTION_DEPENDENCE = Effect(
+    name="direction_dependence",
+    summary="a parameter of the equations differs with the direction of motion (a valve fills faster than it vents)",
+    kind="feedback",
+    stages=("mechanics", "actuator", "environment"),
+    parts=_turned_parts,
+    equation=r"p = p_0 (1 + a\,\mathrm{sgn}\,\dot x)",
+    source="J. C. Dixon, The Shock Absorber Handbook, 2nd ed. 2007, ch. 6 (asymmetry); the same form for any parameter",
+    excitation="slow and fast moves both ways, with rest between them",
+    confusable_with=("static_nonlinearity", "hysteresis"),
+    prepare=_turned_settings,
+    basis=_turned_basis,
+    fill=_turned_fill,
+    report=_turned_report,
+    limits={"relative_change": (-MOST_TURNED, MOST_TURNED)},
+    vanishes_with=(("relative_change",),),
+    acts_on=("direction",),
 )

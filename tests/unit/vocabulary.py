@@ -46,6 +46,7 @@ NAMES = (
     "square_root_outflow",
     "overflow",
     "parameter_variation",
+    "direction_dependence",
     "one_sided_conduction",
     "constant_load",
     "scale_error",

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from hal.trust import trust_program
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_model.ode_systems import CHANNELS, MOTOR, RATE_HZ, command, recorded
+from tests.unit.mismatch_model.ode_systems import CHANNELS, MOTOR, RATE_HZ, command, pendulum, recorded
 from tools.errors import RecordingError
 from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.recording_load import load
@@ -197,3 +197,42 @@ def test_a_parameter_that_has_the_name_of_an_offset_stays_the_engineers(tmp_path
     twin = make(recording)
     assert sorted(p.name for p in twin.parameters) == ["angle_offset", "gain", "tau"]
     assert "offsets" not in twin.to_text(twin.start(recording))
+
+
+def test_a_parameter_may_differ_with_the_direction_of_a_state(tmp_path: Path) -> None:
+    """A tank that fills and empties by different time constants: exponentials of the closed form at a held input."""
+    tank = """
+[twin]
+kind = "ode"
+[twin.states]
+level = "m"
+[twin.equations]
+level = "(feed - level) / tau"
+[twin.parameters]
+tau = 0.2
+hold = "zero"
+"""
+    channels = CHANNELS.replace('"command"', '"feed"').replace('"angle"', '"level"').replace('"rad"', '"m"')
+    u = np.repeat(np.array([1.0, 0.2, 0.7, -0.5, 0.0]), 60)
+    recording = recorded(tmp_path, tank, u, 0.1 * u[::-1], channels)
+    twin = make(recording)
+    (place,) = sites(twin, recording, EFFECTS["direction_dependence"])
+    assert place.target == "tau by direction of level"
+    pairs = twin.place(place.target).pairs  # type: ignore[attr-defined]
+    model = Model(twin, [replace(place, settings={"pairs": pairs})])
+    theta = np.append(model.start(recording)[:-1], -0.4)
+    found = model.simulate(View.whole(recording), theta)["level"]
+    exact = np.zeros(u.size)
+    exact[0] = found[0]
+    for k in range(1, u.size):
+        tau = 0.2 * (1 - 0.4 * np.sign(u[k - 1] - exact[k - 1]))
+        exact[k] = u[k - 1] + (exact[k - 1] - u[k - 1]) * np.exp(-1 / RATE_HZ / tau)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-5)
+    assert {h.name: h.value for h in model.human(theta)[place.label]}["rising_to_falling"] == pytest.approx(0.6 / 1.4)
+
+
+def test_a_velocity_differs_with_the_direction_of_its_position(tmp_path: Path) -> None:
+    recording, _ = pendulum(tmp_path)
+    places = [p.target for p in sites(make(recording), recording, EFFECTS["direction_dependence"])]
+    assert places
+    assert all(p.endswith("by direction of angle") for p in places)

@@ -175,17 +175,26 @@ class EquationLines:
         signals = [f"{s}_" if s in TAKEN else s for s in twin.signals]
         given = [n for n, s in zip(signals, twin.signals, strict=True) if s in self.signals]
         swayed: dict[int, list[str]] = {}
+        turned: set[int] = set()
         for one in inner:
             if one.place.kind == "parameter":
                 parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])
                 follows = [*states, *signals][signal - 1]
                 centre = numbers(one.slot.setting("centre"))
                 swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('per_unit')} * ({follows} - {centre})")
+            if one.place.kind == "direction":
+                parameter, state = (int(v) for v in one.slot.placed.settings[PAIRS])
+                turned.add(state)
+                swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('relative_change')} * way_{state}")
         changed = {r: ") * (".join(parts) for r, parts in swayed.items()}
         shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
         h = "dt" if self.substeps == 1 else f"dt / {self.substeps}"
         lines = [f'h, s, before, began = {h}, np.array(p["start"]), None, 0.0']
         lines += ["", "def derivatives(t, s, u):", f"    {_unpacked(states)} = s", f"    {_unpacked(given)} = u"]
+        if turned:
+            still, plain = program_code(self.programs.rates_program, self._variables(states, signals, {}))
+            ways = [f"way_{j} = np.sign({plain[j - 1]})" for j in sorted(turned)]
+            lines += [f"    {line}" for line in (*still, *ways)]
         lines += [f"    {line}" for line in shared]
         flows = [line for one in inner for line in self._flow(one)]
         moved = [one for one in inner if one.place.kind == "motion"]

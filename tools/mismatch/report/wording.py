@@ -96,6 +96,11 @@ def label(name: str, unit: str) -> str:
     return words(short)
 
 
+def place_inside(p: PhysicsFound) -> str:
+    """Return the place of a force, a flow or a changing parameter inside the twin; "" at inputs and outputs."""
+    return p.target if p.site == "feedback" and p.target not in p.outputs else ""
+
+
 def interval(p: ParameterValue) -> tuple[str, str, str]:
     """Return the interval of an estimate (see ``interval_of``)."""
     return interval_of(p.value, p.ci95)

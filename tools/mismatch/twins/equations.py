@@ -29,14 +29,15 @@ class Place:
     """
 
     name: str
-    kind: Literal["motion", "storage", "storages", "parameter"]
+    kind: Literal["motion", "storage", "storages", "parameter", "direction"]
     position: int
     velocity: int
     target: int
     unit: str
     """Unit of the position, or of the stored quantity."""
     pairs: tuple[float, ...] = ()
-    """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of the signal that it may follow."""
+    """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of what it may follow: a signal, or the
+    direction of a state."""
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ class OdeTwin(Head):
 
     def force_gain(self, target: str, theta: Array) -> tuple[float, str]:
         """Return the gain from the input that drives a place to the derivative there, and that input ("": none)."""
-        if self.place(target).kind == "parameter":
+        if self.place(target).kind in ("parameter", "direction"):
             return 1.0, ""
         row = self.linearised(self.values(theta)).b[self.place(target).target]
         for i, s in enumerate(self.inputs):
@@ -165,6 +165,9 @@ class OdeTwin(Head):
         if place.kind == "parameter":
             signal = run.signals[self.signals[place.position]]
             return signal, np.gradient(signal, run.dt)
+        if place.kind == "direction":
+            ((x, _),) = self._courses(run, theta, (place.position,))
+            return x, np.gradient(x, run.dt)
         (position, _), (velocity, _) = self._courses(run, theta, (place.position, place.velocity))
         return position, velocity
 

@@ -12,7 +12,9 @@ from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import FRICTION, bristle_after, flow_of, friction_limit, smooth_force
 from tools.mismatch.twins.program import run_program
 
-SWAY = 4  # number of columns of a varying parameter: its register, the register that it follows, strength, centre
+SWAY = 5
+"""Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and 1 if it
+follows the sign of that state's derivative (at the constant parameters) in place of the value."""
 
 
 class Drive(NamedTuple):
@@ -46,7 +48,7 @@ class Packed(NamedTuple):
     memory: Array
     flows: Array
     sway: Array
-    """Parameters (k, 4) that follow a state or a signal: p (1 + strength (value - centre)); see ``SWAY``."""
+    """Parameters (k, 5) that follow a signal or a direction: p (1 + strength (value - centre)); see ``SWAY``."""
 
 
 @kernel
@@ -91,7 +93,8 @@ def run_equations(program, drive, packed, x0, limits):
     places = place.shape[0]
     out = np.zeros((n, s))
     registers = registers0.copy()
-    first = np.zeros(max(sway.shape[0], 1))
+    first, way = np.zeros(max(sway.shape[0], 1)), np.zeros(max(sway.shape[0], 1))
+    turns = np.any(sway[:, 4] != 0.0)
     # at the begin of a step, where the derivative is asked for, at the end of the step
     x, y, z = np.zeros(s), np.zeros(s), np.zeros(s)
     rates = np.zeros((5, s))  # derivatives of the four stages, and the one that decides between slip and rest
@@ -163,10 +166,15 @@ def run_equations(program, drive, packed, x0, limits):
                         registers[1 + i] = y[i]
                     for i in range(m):
                         registers[1 + s + i] = u[k - 1, i] + (0.0 if held[i] else share * (u[k, i] - u[k - 1, i]))
+                    if turns:
+                        run_program(operations, registers)
+                        for c in range(sway.shape[0]):
+                            way[c] = np.sign(registers[results[int(sway[c, 1]) - 1]]) if sway[c, 4] != 0.0 else 0.0
                     for c in range(sway.shape[0]):
                         r = int(sway[c, 0])
                         first[c] = registers[r]
-                        registers[r] *= 1.0 + sway[c, 2] * (registers[int(sway[c, 1])] - sway[c, 3])
+                        value = way[c] if sway[c, 4] != 0.0 else registers[int(sway[c, 1])]
+                        registers[r] *= 1.0 + sway[c, 2] * (value - sway[c, 3])
                     run_program(operations, registers)
                     for c in range(sway.shape[0] - 1, -1, -1):
                         registers[int(sway[c, 0])] = first[c]

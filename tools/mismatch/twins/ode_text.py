@@ -112,7 +112,13 @@ def _assembled(
         raise RecordingError(f"{where} the derivatives are not finite where the states start; check 'start' of each")
     about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
     places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
-    places = (*places, *_parameters(recording, states, signals, names, [i for i in free if names[i] not in offsets]))
+    changing = [i for i in free if names[i] not in offsets]
+    places = (*places, *_parameters(recording, states, signals, names, changing))
+    if recording.twin.kind == "ode":
+        first = 1 + len(states) + len(signals)
+        for i, j in _directions(equations, places, x, u, values, changing):
+            name = f"{names[i]} by direction of {states[j].name}"
+            places = (*places, Place(name, "direction", j, j, 0, states[j].unit, (float(first + i), 1.0 + j)))
     units_of = {**own_units, **{n: recording.unit[o] for n, o in offset_of.items()}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
@@ -237,6 +243,25 @@ def _parameters(
         if s in recording.context
         for i in free
     ]
+
+
+def _directions(
+    equations: Equations, places: Sequence[Place], x: Array, u: Array, values: Array, free: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Return (parameter, state): each parameter of a derivative, with the state whose direction it may differ with.
+
+    That is the state itself, or of a velocity its position.
+    """
+    at = np.linspace(0, x.shape[0] - 1, PROBES).astype(int)
+    as_given = rates_at(equations, x[at], u[at], values)
+    out: list[tuple[int, int]] = []
+    for i in free:
+        changed = values.copy()
+        changed[i] = values[i] * 1.01 if values[i] else 1e-3
+        differs = np.any(rates_at(equations, x[at], u[at], changed) != as_given, axis=0)
+        of = [p.position for p in places if p.kind in ("motion", "storage") and differs[p.target]]
+        out += [(i, j) for j in dict.fromkeys(of)]
+    return out
 
 
 def _flat(into: Mapping[int, Sequence[int]]) -> tuple[float, ...]:
