@@ -227,9 +227,10 @@ class Effect:
     sites: tuple[Site, ...] = ("input", "output")
     needs: tuple[str, ...] = ()
     shared: bool = False
-    acts_on: tuple[Literal["motion", "storage", "storages", "parameter", "direction"], ...] = ("motion",)
-    """Where a feedback effect acts: at a velocity, at any other state (a level, a current, a temperature), at all such
-    states at once, on a parameter of differential equations, or on one and the direction in which a state moves."""
+    acts_on: tuple[Literal["motion", "storage", "storages", "parameter", "direction", "joint"], ...] = ("motion",)
+    """Where a feedback effect acts: at a velocity, between two of them (a joint), at any other state (a level, a
+    current, a temperature), at all such states at once, on a parameter of differential equations, or on one and the
+    direction of a state."""
     position_unit: str = ""
     """Unit that the position must have for a feedback effect; empty: any."""
     twins: tuple[str, ...] = ()

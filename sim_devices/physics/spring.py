@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Basis, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves
 from sim_devices.physics.friction import velocity_of
 from sim_devices.physics.statistics import least_squares, thin
@@ -284,14 +285,26 @@ def _gap_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     return {"spring": row}
 
 
-def _gap_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+def _lost_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.clip(x - q[1], -q[0], q[0])[:, None]
+
+
+def _lost_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(SPRING)
+    row[2], row[6], row[7], row[8], row[9] = -w[0], w[0], q[0], q[1], -w[0] * q[1]
+    return {"spring": row}
+
+
+def _gap_guess(
+    x: Array, residual: Array, ctx: Context, settings: Settings, basis: Basis = _gap_basis
+) -> Sequence[Sequence[float]]:
     k = thin(ctx.keep, 8000)
     line = np.stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))], axis=1)
     travel, middle = settings["travel"][0], 0.5 * float(np.max(x[ctx.keep]) + np.min(x[ctx.keep]))
     tried: list[tuple[float, float, float]] = []
     for centre in dict.fromkeys((0.0, middle)):
         for gap in travel * np.array([0.03, 0.1, 0.2, 0.3, 0.4]):
-            column = ctx.to_output(np.ascontiguousarray(_gap_basis(x, ctx, np.array([gap, centre]), settings)[:, 0]))[k]
+            column = ctx.to_output(np.ascontiguousarray(basis(x, ctx, np.array([gap, centre]), settings)[:, 0]))[k]
             tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(gap), centre))
     size = settings["size"][0]
     return tuple((gap, float(np.clip(centre, -size, size))) for _, gap, centre in sorted(tried)[:2])
@@ -305,7 +318,7 @@ def _gap_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     )
 
 
-CLEARANCE = Effect(
+_GAP = Effect(
     name="clearance",
     summary="play at a joint: a spring that takes hold beyond a gap",
     kind="feedback",
@@ -321,3 +334,13 @@ CLEARANCE = Effect(
     fill=_gap_fill,
     report=_gap_report,
 )
+
+_LOST = replace(
+    _GAP,
+    equation=r"F = k\,(d - \max(-g, \min(g, d))),\; d = x_1 - b x_2 - x_0",
+    guess=partial(_gap_guess, basis=_lost_basis),
+    basis=_lost_basis,
+    fill=_lost_fill,
+    acts_on=("joint",),
+)
+CLEARANCE = replace(_GAP, variants=(_LOST,))

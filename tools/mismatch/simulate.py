@@ -23,7 +23,7 @@ from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.linear import roughness
 from tools.mismatch.twins.memo import remember
-from tools.mismatch.twins.ode import inside_of, weight_scale
+from tools.mismatch.twins.ode import PUSHED, inside_of, weight_scale
 
 START_PASSES = 8
 """Most passes that estimate start states behind effects at an output. Each pass corrects for these effects."""
@@ -90,7 +90,7 @@ class Model:
                 u_in, u_out = inside.place_units(pl.target)
             for p in (*parts.nonlinear, *parts.weights):
                 free.append(free_entry(p, u_in, u_out, pl.label + ".", k))
-            if inside is not None and inside.place(pl.target).kind == "motion":
+            if inside is not None and inside.place(pl.target).kind in PUSHED:
                 free[c - len(parts.weights) :] = [
                     replace(f, scale=weight_scale(p.unit, *inside.force_scale(pl.target)))
                     for f, p in zip(free[c - len(parts.weights) :], parts.weights, strict=True)

@@ -19,7 +19,7 @@ from tools.mismatch.twins.base import Signal, travelled
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.memo import remember
-from tools.mismatch.twins.ode import inside_of
+from tools.mismatch.twins.ode import PUSHED, inside_of
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
@@ -58,7 +58,7 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
     a, b = model.slices(k)
     searched = b.stop > b.start and b.start not in model.linear
     inside = inside_of(twin) if pl.site == "feedback" else None
-    flows = inside is not None and inside.place(pl.target).kind != "motion"
+    flows = inside is not None and inside.place(pl.target).kind not in PUSHED
     for q in pl.effect.guess(x, residual, ctx, pl.settings):
         th = theta.copy()
         th[a] = q

@@ -127,6 +127,15 @@ def tanks() -> Recording:
     return equations({**table, "inflow": 1.5, "drain": 0.8, "hold": "zero"}, ("pump",), ("level", "both"), "V")
 
 
+def two_bodies() -> Recording:
+    """Two bodies with a spring between them; an effect may be in that joint."""
+    states = {"motor": "rad", "w_1": "rad/s", "load": "rad", "w_2": "rad/s"}
+    pull = "stiffness * (motor - 2*load)"
+    rates = {"w_1": f"(volts - w_1 - {pull}) / 0.05", "w_2": f"(2*{pull} - w_2 - sin(load)) / 0.2"}
+    table: dict[str, Any] = {"states": states, "equations": {"motor": "w_1", "load": "w_2", **rates}}
+    return equations({**table, "stiffness": 20.0}, ("volts",), ("motor", "load"), "rad")
+
+
 def in_two() -> Recording:
     """Two filters in a row; effects may stand between them."""
     first = {"A": [[-40.0]], "B": [[40.0]], "C": [[0.9]], "D": [[0.1]]}
@@ -159,6 +168,7 @@ TWINS: dict[str, Callable[[], Recording]] = {
     "columns": columns,
     "ode motor": motor,
     "ode tanks": tanks,
+    "ode two bodies": two_bodies,
 }
 
 

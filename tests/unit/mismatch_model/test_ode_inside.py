@@ -206,3 +206,51 @@ def test_flows_begin_in_place_of_the_linear_terms_that_are_their_tangents(tmp_pa
     assert np.all(np.abs(start[[1, 2]]) < 3.0)  # and the linear terms do not
     before = float(np.std(linear.residual(view, given)["level"]))
     assert float(np.std(model.residual(view, start)["level"])) < 0.5 * before
+
+
+TWO_BODIES = """
+[twin]
+kind = "ode"
+[twin.states]
+motor = "rad"
+motor_speed = "rad/s"
+load = "rad"
+load_speed = "rad/s"
+[twin.equations]
+motor = "motor_speed"
+motor_speed = "(torque - 0.6 * motor_speed - stiffness * (motor - 3 * load)) / 0.05"
+load = "load_speed"
+load_speed = "(3 * stiffness * (motor - 3 * load) - 2 * load_speed) / 0.9"
+[twin.parameters]
+stiffness = 40.0
+"""
+
+
+def test_play_of_a_joint_is_a_spring_that_takes_hold_beyond_the_gap(tmp_path: Path) -> None:
+    """A geared joint with play against scipy's integrator over the same law, sample by sample."""
+    u = 2.0 * command()
+    channels = CHANNELS.replace('"command"', '"torque"').replace('"angle"', '"load"').replace('"V"', '"N m"')
+    recording = recorded(tmp_path, TWO_BODIES, u, 0.1 * u[::-1], channels)
+    twin = make(recording)
+    (place,) = sites(twin, recording, EFFECTS["clearance"])[-1:]
+    assert place.target == "motor - 3 load"
+    model = Model(twin, [replace(place, settings={"size": (1.0,), "travel": (1.0,)})])
+    theta = model.start(recording)
+    a, b = model.slices(0)
+    theta[a], theta[b] = (0.02, 0.005), 40.0 / 0.05
+    found = model.simulate(View.whole(recording), theta)["load"]
+    start = model.start_states(View.whole(recording), theta)
+
+    def rates(t: float, x: np.ndarray, k: int) -> list[float]:
+        torque = u[k] + (u[k + 1] - u[k]) * (t * RATE_HZ - k)
+        d = x[0] - 3 * x[2] - 0.005
+        pull = 40.0 * (x[0] - 3 * x[2] - np.clip(d, -0.02, 0.02))
+        return [x[1], (torque - 0.6 * x[1] - pull) / 0.05, x[3], (3 * pull - 2 * x[3]) / 0.9]
+
+    x, course = start, [start[2]]
+    for k in range(u.size - 1):
+        x = solve_ivp(rates, (k / RATE_HZ, (k + 1) / RATE_HZ), x, args=(k,), rtol=1e-9, atol=1e-12).y[:, -1]
+        course.append(x[2])
+    plain = Model(twin).simulate(View.whole(recording), theta[: model.n_base])["load"]
+    assert np.std(found - plain) > 0.01 * np.std(found)
+    np.testing.assert_allclose(found, course, rtol=0, atol=2e-3 * np.std(plain - found))

@@ -481,6 +481,8 @@ def _amplitude_damping(s: Slot) -> ForceCode:
 
 def _clearance(s: Slot) -> ForceCode:
     inside = f"np.clip(x - {s.at('centre')}, -{s.at('half_gap')}, {s.at('half_gap')})"
+    if "joint" in s.placed.effect.acts_on:
+        return ForceCode(f" + {s.at('stiffness')} * {inside}")
     return ForceCode(f" - {s.at('stiffness')} * (x - {s.at('centre')} - {inside})")
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim_devices.physics.effect import Array
 from sim_devices.physics.flows import PAIRS, flow_pairs, level_names, storages_of
 from tools.errors import InputError
 from tools.guest.equations import (
@@ -40,7 +41,7 @@ from tools.guest.equations import (
 from tools.mismatch.export.effects import FORCES, ForceCode, Slot, force, joined, numbers
 from tools.mismatch.export.motion import bend_code, sum_code
 from tools.mismatch.twins.equations import Place, Programs
-from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.ode import PUSHED, OdeTwin
 
 _CALLS = {
     ABS: "abs", SIGN: "np.sign", SQRT: "np.sqrt", EXP: "np.exp", LOG: "np.log", SIN: "np.sin", COS: "np.cos",
@@ -134,6 +135,8 @@ class EquationLines:
     substeps: int
     gains: Mapping[str, float]
     """Change of the derivative at the place of a force, per unit of the force."""
+    values: Array
+    """Parameters (p,) of the equations."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.twin.equations, Programs):
@@ -197,7 +200,7 @@ class EquationLines:
             lines += [f"    {line}" for line in (*still, *ways)]
         lines += [f"    {line}" for line in shared]
         flows = [line for one in inner for line in self._flow(one)]
-        moved = [one for one in inner if one.place.kind == "motion"]
+        moved = [one for one in inner if one.place.kind in PUSHED]
         pushes, more = self._forces(moved)
         if sum(map(len, rates)) > LONG:
             lines += [f"    rate_{i + 1} = {r}" for i, r in enumerate(rates)]
@@ -244,13 +247,23 @@ class EquationLines:
             if springs:
                 terms += f"{' ' if terms else ''}- springs @ np.clip(x - held, -radii, radii)"
             if terms:
-                pushes += [
-                    f"x, v = s[{place.position}], s[{place.velocity}]",
-                    f"rates[{place.target}] += {gain} * ({terms})",
-                ]
+                pushes += self._push(place, f"{gain} * ({terms})")
         if not special:
             return pushes, self._moving(None, [])
         return pushes, self._moving(at[special[0]], by[special[0]])
+
+    def _push(self, place: Place, push: str) -> list[str]:
+        """Return the lines that add a force, in terms of x and v, to one derivative, or to those of a joint."""
+        if place.kind != "joint":
+            return [f"x, v = s[{place.position}], s[{place.velocity}]", f"rates[{place.target}] += {push}"]
+        other, speed, target = (int(i) for i in place.pairs[:3])
+        ratio, back = numbers(place.pairs[3]), numbers(self.twin.reaction(place, self.values))
+        return [
+            f"x, v = s[{place.position}] - {ratio} * s[{other}], s[{place.velocity}] - {ratio} * s[{speed}]",
+            f"push = {push}",
+            f"rates[{place.target}] += push",
+            f"rates[{target}] += {back} * push",
+        ]
 
     def _moving(self, place: Place | None, codes: Sequence[ForceCode]) -> list[str]:
         """Return the lines of ``moving(t, drive)``. ``codes``: the forces at ``place`` that a Runge-Kutta step alone

@@ -24,7 +24,7 @@ from tools.mismatch.simulate_text import describe
 from tools.mismatch.twins.base import Force
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin, between_of
 from tools.mismatch.twins.dynamic import DynamicTwin
-from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.ode import PUSHED, OdeTwin
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.twins.static import StaticTwin
 from tools.mismatch.twins.vocabulary import find_user_kind
@@ -93,7 +93,7 @@ class _Module:
         gain = self.twin.input_gain(self.twin.inputs[0], self.theta) if is_force else 1.0
         if isinstance(self.twin, OdeTwin) and is_force:
             u_in, u_out = self.twin.place_units(pl.target)
-            is_force = self.twin.place(pl.target).kind == "motion"
+            is_force = self.twin.place(pl.target).kind in PUSHED
             gain = self.twin.force_gain(pl.target, self.theta)[0] if is_force else 1.0
         weights = {p.name for p in pl.parts.weights}
         carried = self.twin.input_gain(pl.target, self.theta) if pl.site == "input" and pl.effect.kind == "add" else 1.0
@@ -286,8 +286,8 @@ class _Module:
             for pl, (a, b) in ((pl, self.model.slices(k)) for k, pl in enumerate(self.model.placed))
             if pl.site == "feedback"
         ]
-        substeps = twin.substeps(self.recording.dt, twin.packed(forces))
-        lines = EquationLines(twin, _name, substeps, gains)
+        substeps = twin.substeps(self.recording.dt, twin.packed(forces, twin.values(self.theta)))
+        lines = EquationLines(twin, _name, substeps, gains, twin.values(self.theta))
         self.writer.run += [f'{_name(s)} = u["{s}"]' for s in lines.see(inner)]
         self.writer.setup += lines.setup(inner)
         self.writer.run += lines.run()

@@ -15,7 +15,7 @@ from sim_devices.physics.forces import FLOW
 from tools.guest.equations import Program
 from tools.mismatch.twins.affine import is_affine
 from tools.mismatch.twins.feedback import Rows
-from tools.mismatch.twins.ode_run import SWAY, Drive, Packed, rates_of, run_equations, run_readings
+from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive, Packed, rates_of, run_equations, run_readings
 
 LEAST_SHOWN = 3e-4  # least singular value of a fitted combination of start states, relative to the largest
 
@@ -29,7 +29,7 @@ class Place:
     """
 
     name: str
-    kind: Literal["motion", "storage", "storages", "parameter", "direction"]
+    kind: Literal["motion", "storage", "storages", "parameter", "direction", "joint"]
     position: int
     velocity: int
     target: int
@@ -37,7 +37,8 @@ class Place:
     """Unit of the position, or of the stored quantity."""
     pairs: tuple[float, ...] = ()
     """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of what it may follow: a signal, or the
-    direction of a state."""
+    direction of a state. Of a joint: position, velocity and target of its other side, the ratio b of x_1 - b x_2, and
+    the typical size and speed of that."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class Inside:
     rows: tuple[Rows, ...]
     flows: Array
     sway: Array
+    joints: Array
+    """Rows (k, JOINT), see there."""
     fastest_per_s: float = 0.0
 
     @cached_property
@@ -70,10 +73,11 @@ class Inside:
             join([r.memory for r in rows]),
             self.flows,
             self.sway,
+            self.joints,
         )
 
 
-NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)))
+NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)), np.zeros((0, JOINT)))
 
 
 class Equations(Protocol):

@@ -33,10 +33,14 @@ from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import remember, stored
-from tools.mismatch.twins.ode_run import SWAY, Drive
+from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive
 
 MOST_SUBSTEPS = 200
 FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
+
+
+PUSHED = ("motion", "joint")
+"""Kinds of places at which a force acts."""
 
 
 @dataclass(frozen=True)
@@ -147,13 +151,15 @@ class OdeTwin(Head):
         """Return the units of a force at a place (that of the input that drives it, if any) and of its position."""
         place = self.place(target)
         _, source = self.force_gain(target, self.start_values[list(self.free)])
-        per = "s^2" if place.kind == "motion" else "s"
+        per = "s^2" if place.kind in PUSHED else "s"
         return (self.units[source] if source else f"{place.unit}/{per}"), place.unit
 
     def force_scale(self, target: str) -> tuple[float, float, float]:
         """Return typical derivative, position and velocity at a place, which scale the weights."""
         place = self.place(target)
         size, speed = self.typical[place.position], self.typical[place.velocity]
+        if place.kind == "joint":
+            size, speed = place.pairs[4:]
         if place.kind == "storage":
             speed = size * self.fastest_per_s
             return speed, size, speed
@@ -168,6 +174,11 @@ class OdeTwin(Head):
         if place.kind == "direction":
             ((x, _),) = self._courses(run, theta, (place.position,))
             return x, np.gradient(x, run.dt)
+        if place.kind == "joint":
+            other, speed, _, ratio = place.pairs[:4]
+            sides = (place.position, place.velocity, int(other), int(speed))
+            (x, _), (v, _), (x_2, _), (v_2, _) = self._courses(run, theta, sides)
+            return x - ratio * x_2, v - ratio * v_2
         (position, _), (velocity, _) = self._courses(run, theta, (place.position, place.velocity))
         return position, velocity
 
@@ -229,8 +240,17 @@ class OdeTwin(Head):
         u = np.column_stack([run.signals[s] for s in self.signals])
         return self.equations.readings(x, u, run.t, self.values(theta))
 
-    def packed(self, forces: Sequence[Force]) -> Inside:
-        """Return forces and flows, packed for the compiled loop."""
+    def reaction(self, place: Place, values: Array) -> float:
+        """Return the change of the second derivative of a joint per change of the first: the inertias are the twin's.
+
+        The spring of the joint pulls both sides: its two slopes are as the inverse inertias.
+        """
+        a = self.linearised(values).a
+        other, _, target, ratio = place.pairs[:4]
+        return -ratio * float(a[int(target), place.position] / a[place.target, int(other)])
+
+    def packed(self, forces: Sequence[Force], values: Array) -> Inside:
+        """Return forces and flows, packed for the compiled loop; ``values``: the parameters of the equations."""
         by: dict[str, list[Force]] = {}
         for f in forces:
             by.setdefault(f.target, []).append(f)
@@ -238,12 +258,18 @@ class OdeTwin(Head):
         sway: list[Array] = []
         rows: list[Rows] = []
         flows: list[Array] = []
+        joints: list[Array] = []
         for name, here in by.items():
             filled = [f.effect.fill(f.q, f.weights, f.settings) for f in here if f.effect.fill is not None]
             flows += [r["flows"].reshape(-1, FLOW) for r in filled if "flows" in r]
             sway += [r["sway"] for r in filled if "sway" in r]
             solid = [f for f, r in zip(here, filled, strict=True) if not {"flows", "sway"} & set(r)]
-            if solid:
+            if solid and self.place(name).kind == "joint":
+                p = self.place(name)
+                other, speed, target, ratio = p.pairs[:4]
+                sides = [p.position, p.velocity, p.target, other, speed, target, ratio, self.reaction(p, values)]
+                joints.append(np.array([*sides, *pack(solid).spring]))
+            elif solid:
                 p, row = self.place(name), pack(solid)
                 smooth = bool(np.any(row.spring) or np.any(row.cogging) or row.friction[4])
                 place.append((p.position, p.velocity, p.target, int(smooth)))
@@ -253,6 +279,7 @@ class OdeTwin(Head):
             tuple(rows),
             np.concatenate(flows) if flows else np.zeros((0, FLOW)),
             np.array(sway, np.float64).reshape(-1, SWAY),
+            np.array(joints, np.float64).reshape(-1, JOINT),
             fastest_of(forces),
         )
 
@@ -279,7 +306,7 @@ class OdeTwin(Head):
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """Return states (n, s) of a free run from start states that the measured samples of each stretch set."""
         values = self.values(theta)
-        inside = self.packed(forces)
+        inside = self.packed(forces, values)
         sub = self.substeps(run.dt, inside)
         u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
         limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))
@@ -421,7 +448,10 @@ class OdeTwin(Head):
             b = lin.b[:, self.signals.index(signal)]
         else:
             b = np.zeros(len(self.state_list))
-            b[self.place(signal).target] = 1.0
+            place = self.place(signal)
+            b[place.target] = 1.0
+            if place.kind == "joint":
+                b[int(place.pairs[2])] = self.reaction(place, self.values(theta))
         d = discretise(lin.a, b, run.dt, self.holds.get(signal, "linear"))
         c = dict(zip(self.outputs, lin.c, strict=True))
         ss = start_state(d.ad, c, run if self.integrates else replace(run, setting=None))

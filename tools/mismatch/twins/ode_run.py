@@ -9,12 +9,16 @@ from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
-from sim_devices.physics.forces import FRICTION, bristle_after, flow_of, friction_limit, smooth_force
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, flow_of, friction_limit, smooth_force
 from tools.mismatch.twins.program import run_program
 
 SWAY = 5
 """Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and 1 if it
 follows the sign of that state's derivative (at the constant parameters) in place of the value."""
+
+JOINT = 8 + SPRING
+"""Number of columns of a joint: position, velocity and target of both sides, the ratio b of its travel x_1 - b x_2, the
+change of the second derivative per change of the first, and the spring (``forces.SPRING``)."""
 
 
 class Drive(NamedTuple):
@@ -49,6 +53,8 @@ class Packed(NamedTuple):
     flows: Array
     sway: Array
     """Parameters (k, 5) that follow a signal or a direction: p (1 + strength (value - centre)); see ``SWAY``."""
+    joints: Array
+    """Smooth forces (k, JOINT) between two bodies."""
 
 
 @kernel
@@ -86,7 +92,7 @@ def run_equations(program, drive, packed, x0, limits):
     """
     operations, registers0, results = program
     u, held, times, step_s, sub, starts, stop = drive
-    place, friction, spring, cogging, counts, thresholds, memory, flows, sway = packed
+    place, friction, spring, cogging, counts, thresholds, memory, flows, sway, joints = packed
     lowest, highest = limits
     n, m = u.shape
     s = x0.shape[1]
@@ -94,6 +100,7 @@ def run_equations(program, drive, packed, x0, limits):
     out = np.zeros((n, s))
     registers = registers0.copy()
     first, way = np.zeros(max(sway.shape[0], 1)), np.zeros(max(sway.shape[0], 1))
+    no_cogging, no_friction = np.zeros(COGGING), np.zeros(FRICTION)
     turns = np.any(sway[:, 4] != 0.0)
     # at the begin of a step, where the derivative is asked for, at the end of the step
     x, y, z = np.zeros(s), np.zeros(s), np.zeros(s)
@@ -183,6 +190,13 @@ def run_equations(program, drive, packed, x0, limits):
                     for c in range(flows.shape[0]):
                         f = flow_of(y[int(flows[c, 1])], flows[c, 0], flows[c, 3], flows[c, 4])
                         rates[stage, int(flows[c, 2])] += f
+                    for c in range(joints.shape[0]):
+                        b = joints[c, 6]
+                        p = y[int(joints[c, 0])] - b * y[int(joints[c, 3])]
+                        v = y[int(joints[c, 1])] - b * y[int(joints[c, 4])]
+                        f = smooth_force(p, v, joints[c, 8:], no_cogging, no_friction, 0)
+                        rates[stage, int(joints[c, 2])] += f
+                        rates[stage, int(joints[c, 5])] += joints[c, 7] * f
                     e = 0
                     for c in range(places):
                         p, v, f, row = y[place[c, 0]], y[place[c, 1]], 0.0, c * FRICTION

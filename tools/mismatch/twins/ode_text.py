@@ -111,7 +111,9 @@ def _assembled(
     if not rates:
         raise RecordingError(f"{where} the derivatives are not finite where the states start; check 'start' of each")
     about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
-    places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
+    slopes = linearise(equations, *middle, typical, values).a
+    places = _places(equations, states, x, u, values, slopes)
+    places = (*places, *_joints(places, states, x, slopes))
     changing = [i for i in free if names[i] not in offsets]
     places = (*places, *_parameters(recording, states, signals, names, changing))
     if recording.twin.kind == "ode":
@@ -224,6 +226,37 @@ def _places(
         name = "+".join(states[i].name for i in stores)
         out.append(Place(name, "storages", first, first, first, states[first].unit, _flat(into)))
     return tuple(out)
+
+
+def _joints(places: Sequence[Place], states: tuple[State, ...], x: Array, slopes: Array) -> list[Place]:
+    """Return the springs between two positions, whose travel is ``x_1 - b x_2``; x: states (n, s) of a run as given.
+
+    A side without a spring of its own to ground moves with the joint alone, and so shows b. Either may be that side.
+    """
+    moving = [p for p in places if p.kind == "motion" and p.position != p.velocity]
+    out: list[Place] = []
+    for k, p in enumerate(moving):
+        for q in moving[k + 1 :]:
+            to, back = slopes[p.target, q.position], slopes[q.target, p.position]
+            own, others = slopes[p.target, p.position], slopes[q.target, q.position]
+            if to * back <= 0.0 or own * to >= 0.0 or others * back >= 0.0:
+                continue
+            ratios = [float(-to / own), float(-others / back)]
+            if abs(ratios[0] - ratios[1]) < SAME_RATIO * abs(ratios[0]):
+                ratios = ratios[:1]
+            for b in ratios:
+                sizes = [float(np.std(x[:, p.position] - b * x[:, q.position]))]
+                sizes += [float(np.std(x[:, p.velocity] - b * x[:, q.velocity]))]
+                name = f"{states[p.position].name} - {b:.4g} {states[q.position].name}"
+                name = name.replace(" 1 ", " ")
+                sides = (q.position, q.velocity, q.target, b, *(s or 1e-9 for s in sizes))
+                one = Place(name, "joint", p.position, p.velocity, p.target, p.unit, tuple(map(float, sides)))
+                out.append(one)
+    return out
+
+
+SAME_RATIO = 0.01
+"""Relative difference of the two ratios of a joint below which they are one."""
 
 
 def _parameters(

@@ -1,0 +1,90 @@
+"""Play in the joint of two bodies, which the simulation joins by a spring; the truth has an integrator of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from tests.unit.mismatch_engine.cases import Array
+from tools.mismatch.infer import diagnose
+from tools.mismatch.recording_load import load
+
+RATE_HZ, SUBSTEPS = 200.0, 20
+DRIVE = """
+format = 1
+data = "data.npz"
+rate_hz = 200.0
+[twin]
+kind = "ode"
+[twin.states]
+motor = "rad"
+motor_speed = "rad/s"
+load = "rad"
+load_speed = "rad/s"
+[twin.equations]
+motor = "motor_speed"
+motor_speed = "(torque - 0.15*motor_speed - stiffness*(motor - load)) / motor_inertia"
+load = "load_speed"
+load_speed = "(stiffness*(motor - load) - load_drag*load_speed) / 0.08"
+[twin.parameters]
+stiffness = 27.0
+motor_inertia = 0.021
+load_drag = 0.047
+hold = "zero"
+[[channels]]
+column = "torque"
+role = "input"
+signal = "torque"
+unit = "N m"
+[[channels]]
+column = "motor"
+role = "output"
+signal = "motor"
+unit = "rad"
+[[channels]]
+column = "load"
+role = "output"
+signal = "load"
+unit = "rad"
+"""
+
+
+@numba.njit
+def driven(u: Array, gap: float) -> Array:
+    """Return both angles (n, 2) by the midpoint rule; no torque passes within ``gap`` to either side."""
+    h = 1.0 / (RATE_HZ * SUBSTEPS)
+    x, m, rate = np.zeros(4), np.zeros(4), np.zeros(4)
+    course = np.empty((u.size, 2))
+    for k in range(u.size):
+        course[k, 0], course[k, 1] = x[0], x[2]
+        for _ in range(SUBSTEPS):
+            for half in range(2):
+                y = x if half == 0 else m
+                d = y[0] - y[2]
+                pull = 30.0 * (d - min(max(d, -gap), gap))
+                rate[0], rate[1] = y[1], (u[k] - 0.15 * y[1] - pull) / 0.02
+                rate[2], rate[3] = y[3], (pull - 0.05 * y[3]) / 0.08
+                if half == 0:
+                    m[:] = x + 0.5 * h * rate
+            x += h * rate
+    return course
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.015])
+def test_play_in_a_joint_is_named_with_its_size_and_place(tmp_path: Path, gap: float) -> None:
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 50), 30)
+    y = driven(u, gap) + rng.normal(0.0, 0.002, (u.size, 2))
+    np.savez(tmp_path / "data.npz", torque=u, motor=y[:, 0], load=y[:, 1])
+    (tmp_path / "recording.toml").write_text(DRIVE)
+    report = diagnose(load(tmp_path), jobs=1)
+    if not gap:
+        assert report.physics == ()
+        return
+    (found,) = report.physics
+    assert (found.name, found.target) == ("clearance", "motor - load")
+    assert found.parameters["gap"].value == pytest.approx(2 * gap, rel=0.1)
