@@ -95,7 +95,8 @@ although friction is named. A wrong `noise_rms` is the usual cause of a wrong ve
 it. Where inputs differ, give each its own: `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function ([a twin of your own](adding/twin.md)). An output that has the name of
-a state is converted to the state's unit. The engine tries missing forces at every state:
+a state is converted to the state's unit. The engine tries missing forces at every state, play between two bodies that a
+spring joins, and parameters that differ with the direction of motion:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
