@@ -27,10 +27,14 @@ def shift_by(x, at, total):
 
 
 @kernel
-def best_shifts(costs, price):
-    """Return the cheapest path of shifts over windows: ``costs`` (windows, shifts), ``price`` per change (Viterbi)."""
+def best_shifts(costs, price, zero):
+    """Return the cheapest path of shifts over windows: ``costs`` (windows, shifts), ``price`` per change (Viterbi).
+
+    Before the record the shift is none, column ``zero``: another one from the first window on is a change, too.
+    """
     w, m = costs.shape
-    total = costs[0].copy()
+    total = costs[0] + price
+    total[zero] -= price
     back = np.zeros((w, m), np.int64)
     for i in range(1, w):
         cheapest = 0
@@ -122,14 +126,14 @@ def _path_of_shifts(model: Array, measured: Array, local: bool) -> tuple[list[in
     zero = int(np.flatnonzero(shifts == 0)[0])
     floor = robust_rms(np.sqrt(costs.min(axis=1) / window)) + float(np.median(np.sqrt(costs.min(axis=1) / window)))
     price = 30.0 * floor * floor + 0.3 * float(np.median(costs.min(axis=1)))
-    path, best = best_shifts(costs, price)
+    path, best = best_shifts(costs, price, zero)
     if not local:
         # neighbouring samples of coloured noise agree on a shift: the price is that of their long-run variance
         k = np.arange(count * window)
         left = (y[k] - x[np.clip(k + np.repeat(shifts[path], window), 0, n - 1)]).reshape(count, window).mean(axis=1)
         long_run = 0.5 * window * robust_rms(np.diff(left)) ** 2
         if long_run > floor * floor:
-            path, best = best_shifts(costs, price * long_run / (floor * floor))
+            path, best = best_shifts(costs, price * long_run / (floor * floor), zero)
     before = float(costs[:, zero].sum())
     change = np.flatnonzero(np.diff(path)) + 1
     if not change.size or change.size > MOST_DROPS or before <= 0:

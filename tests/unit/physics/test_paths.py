@@ -232,7 +232,7 @@ def test_exponential_against_scipy() -> None:
 
 def test_cheapest_path_compiled_equals_python() -> None:
     costs = np.random.default_rng(2).random((12, 5))
-    a, b = best_shifts(costs, 0.4), best_shifts.py_func(costs, 0.4)
+    a, b = best_shifts(costs, 0.4, 2), best_shifts.py_func(costs, 0.4, 2)
     np.testing.assert_array_equal(a[0], b[0])
     assert a[1] == pytest.approx(b[1])
 
@@ -254,3 +254,12 @@ def test_straight_resampling_equals_python_and_interpolation() -> None:
     np.testing.assert_allclose(found, resample_straight.py_func(x, -1.3, 1.01, 1e-4), atol=1e-12)
     k = np.arange(80)
     np.testing.assert_allclose(found, np.interp(-1.3 + (1.01 + 1e-4 * k) * k, k, x), atol=1e-12)
+
+
+def test_a_shift_from_the_first_window_on_is_paid_like_any_other() -> None:
+    """Two shifts over three windows: the first window alone would choose the other one, for less than a change."""
+    costs = np.array([[0.3, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    path, left = best_shifts(costs, 0.4, 0)
+    assert (path.tolist(), left) == ([0, 0, 0], 0.3)
+    path, left = best_shifts(costs, 0.1, 0)
+    assert (path.tolist(), left) == ([1, 0, 0], pytest.approx(0.2))
