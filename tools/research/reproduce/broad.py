@@ -108,8 +108,8 @@ def rows_not_given() -> list[Row]:
 
 
 def _decisive(errors: Sequence[tuple[Trial, tuple[float, ...], tuple[float, ...]]]) -> str:
-    """Return which of the trials, with our errors and vqf's, raises the share of vqf's error most, and what it is
-    without this trial; empty with fewer than two."""
+    """Return which of the trials, with our errors and vqf's, raises the share of vqf's error most, what the share is
+    without this trial, and how far the field itself is off there; empty with fewer than two."""
     if len(errors) < 2:
         return ""
 
@@ -119,7 +119,11 @@ def _decisive(errors: Sequence[tuple[Trial, tuple[float, ...], tuple[float, ...]
 
     k = min(range(len(errors)), key=without)
     trial, ours, vqf = errors[k]
-    return f"; {without(k):.2f} without trial {trial.name} (heading off by {ours[1]:.1f} deg, vqf's by {vqf[1]:.1f})"
+    start, moving = trial.field_heading_deg()
+    return (
+        f"; {without(k):.2f} without trial {trial.name} (heading off by {ours[1]:.1f} deg, vqf's by {vqf[1]:.1f}; by "
+        f"the true attitude the field itself is off by {start:.1f} deg at the start and {moving:.1f} in motion)"
+    )
 
 
 def _means(

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from tools.research.reproduce.orientation_error import Array, east_north_up, rms_errors_deg
 from tools.research.reproduce.recordings import data_folder, meta
 
 BROAD_HZ = 1.0 / 0.0035
+START_S = 5.0
+"""Time after the first row with a true attitude that counts as the start of a trial; the body rests there."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,19 @@ class Trial:
     def errors_deg(self, attitude: Array) -> tuple[float, float, float]:
         """Total, heading, inclination rms of quaternions (n, 4) whose world has x to magnetic north."""
         return rms_errors_deg(east_north_up(attitude), self.truth, self.counts)
+
+    def field_heading_deg(self) -> tuple[float, float]:
+        """Angle in deg between north and the horizontal part of the field that the true attitude puts into the world:
+        median of its size over ``START_S``, and over the rows that count.
+
+        A filter that begins with the field begins with the first, and the second is what its magnetometer tells it.
+        """
+        seen = np.all(np.isfinite(self.truth), axis=1) & np.all(np.isfinite(self.field), axis=1)
+        attitude = Rotation.from_quat(np.roll(self.truth[seen], -1, axis=1))
+        east, north, _ = attitude.apply(self.field[seen]).T
+        off = np.abs(np.degrees(np.arctan2(east, north)))
+        start = np.flatnonzero(seen) < START_S * BROAD_HZ + int(np.argmax(seen))
+        return float(np.median(off[start])), float(np.median(off[self.counts[seen]]))
 
 
 def trials() -> list[Trial]:
