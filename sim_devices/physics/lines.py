@@ -106,9 +106,10 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
         f0 += mean_turn(carrier(ctx.t, residual, f0, width), whole) / width
         z = carrier(ctx.t, residual, f0, width)
         power = float(np.mean(np.abs(z[whole]) ** 2)) if whole.sum() > 8 else 0.0
-        if power > 0:
-            # noise of one window from second differences; what varies beyond it is wander
-            pair = whole[1:] & whole[:-1]
+        pair = whole[1:] & whole[:-1]
+        if power > 0 and pair.any():
+            # noise of one window from first differences; what varies beyond it is wander. Recordings that are shorter
+            # than two windows have no pair, and no wander that noise could be told from.
             rough = float(np.mean(np.abs(np.diff(z)[pair]) ** 2)) / 2
             wander = float(np.var(z[whole]))
             if wander > max(1.5 * rough, 0.01 * power):

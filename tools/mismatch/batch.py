@@ -195,10 +195,14 @@ def on_cluster(address: str) -> Iterator[int]:
     from joblib import parallel_config
 
     with _client(address) as client:
+        from dask import config
+
         threads = sum(cast(dict[str, int], client.nthreads()).values())  # of a client that is not asynchronous
         if threads == 0:
             raise InputError(f"--dask {address}: the scheduler has no workers; start one: dask worker {address}")
-        with parallel_config(backend="dask", client=client, retries=RETRIES, pure=False):
+        # what all pieces share is sent once as it is: Dask's advice to load it on the cluster does not apply
+        quiet = config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"})
+        with quiet, parallel_config(backend="dask", client=client, retries=RETRIES, pure=False):
             yield threads
 
 

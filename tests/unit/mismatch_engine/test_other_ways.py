@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -167,3 +169,20 @@ def test_pieces_in_processes_and_in_order(monkeypatch: pytest.MonkeyPatch) -> No
     two = workers.mapped(problem, _twice, work, 2)
     assert one == two == [0.0, 2.0, 4.0, 6.0, 8.0]
     assert told == [1, 2, 3, 4, 5]
+
+
+def _counted(piece: int, shared: dict[str, Any], half: float) -> tuple[float, int, int]:
+    shared["pieces"] += 1
+    return piece + float(shared["ramp"][-1]) + half, os.getpid(), shared["pieces"]
+
+
+def test_a_worker_unpacks_once_what_all_pieces_share(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = stack(np.zeros(100), np.zeros(100))
+    problem = Problem(rec, make(rec), Split(100, ((0, 100),), (), (), ()), 0, 0)
+    monkeypatch.setattr(workers, "LEAST_SAMPLES", 0)
+    shared = {"pieces": 0, "ramp": np.arange(300_000.0)}  # more than joblib sends by pipe
+    found = workers.mapped(problem, _counted, [(i, shared, 0.5) for i in range(20)], 2)
+    assert [f[0] for f in found] == [i + 299_999.5 for i in range(20)]
+    counts = {pid: [n for _, p, n in found if p == pid] for _, pid, _ in found}
+    assert os.getpid() not in counts
+    assert all(sorted(n) == list(range(1, len(n) + 1)) for n in counts.values())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -151,3 +154,19 @@ def test_a_slew_limit_of_a_file_without_settings_is_reported() -> None:
         assert effect.report is not None
         found = effect.report(np.array([3.0, 2.0, 0.1][: len(effect.parts({}).nonlinear)]), {}, 1.0)
         assert next(h.value for h in found if h.name == "rate_up") == 3.0
+
+
+def test_a_line_in_recordings_shorter_than_two_windows_is_steady() -> None:
+    n, every = 6000, 250  # windows of ten periods, of which every other one is kept
+    t = np.arange(n) * DT
+    swelling = (1.0 + t / 6.0) * np.sin(2 * np.pi * 20.0 * t)
+    rest = swelling + 0.01 * np.random.default_rng(5).standard_normal(n)
+    vibration = EFFECTS["vibration"].prepare
+    assert vibration is not None
+    knots = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for name, mask in (("apart", np.arange(n) // every % 2 == 0), ("whole", None)):
+            knots[name] = len(vibration(rest, rest, replace(context(n), mask=mask))["knots_s"])
+    assert knots["apart"] == 1
+    assert knots["whole"] > 1

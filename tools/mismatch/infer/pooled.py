@@ -54,8 +54,9 @@ def folds_of(problem: Problem) -> tuple[Problem, ...]:
     )
 
 
-def left_out(fold: Problem, model: Model, theta: Array) -> tuple[dict[str, Array], bool]:
-    """Fit a fold from ``theta`` and return the residuals of its held-out rows, and False if the fit failed."""
+def left_out(problem: Problem, model: Model, theta: Array, k: int) -> tuple[dict[str, Array], bool]:
+    """Fit fold ``k`` from ``theta`` and return the residuals of its held-out rows, and False if the fit failed."""
+    fold = folds_of(problem)[k]
     again = fit(fold, model, [theta], iterations=ITERATIONS)
     residual = again.residual if again.ok else residuals(fold, model, theta)
     return {o: r[fold.held_rows] for o, r in residual.items()}, again.ok
@@ -86,7 +87,7 @@ class PooledStore(Store):
             return fitted
         # made anew for each set, because the views of a problem keep columns
         folds = folds_of(self.problem)
-        work = [(f, fitted.model, fitted.theta) for f in folds]
+        work = [(self.problem, fitted.model, fitted.theta, k) for k in range(len(folds))]
         found = mapped(self.problem, left_out, work, self.jobs)
         residual = {o: r.copy() for o, r in fitted.residual.items()}
         for fold, (left, _) in zip(folds, found, strict=True):
