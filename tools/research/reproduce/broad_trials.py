@@ -41,16 +41,16 @@ class Trial:
 
     def field_heading_deg(self) -> tuple[float, float]:
         """Angle in deg between north and the horizontal part of the field that the true attitude puts into the world:
-        median of its size over ``START_S``, and over the rows that count.
+        size of its median over ``START_S`` of rest, and median of its size over the rows that count.
 
         A filter that begins with the field begins with the first, and the second is what its magnetometer tells it.
         """
         seen = np.all(np.isfinite(self.truth), axis=1) & np.all(np.isfinite(self.field), axis=1)
         attitude = Rotation.from_quat(np.roll(self.truth[seen], -1, axis=1))
         east, north, _ = attitude.apply(self.field[seen]).T
-        off = np.abs(np.degrees(np.arctan2(east, north)))
+        off = np.degrees(np.arctan2(east, north))
         start = np.flatnonzero(seen) < START_S * BROAD_HZ + int(np.argmax(seen))
-        return float(np.median(off[start])), float(np.median(off[self.counts[seen]]))
+        return abs(float(np.median(off[start]))), float(np.median(np.abs(off[self.counts[seen]])))
 
 
 def trials() -> list[Trial]:
