@@ -324,6 +324,32 @@ noise_rms = 1e-5
         limits_of(open_situation(file, Asked()), Asked(bench={"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}))
 
 
+def test_a_program_of_the_bench_is_refused_for_two_inputs(tmp_path: Path, report: dict[str, Any]):
+    drives = "".join(
+        f'[[channels]]\ncolumn = "{s}"\nrole = "input"\nsignal = "{s}"\nunit = "V"\n' for s in ("left", "right")
+    )
+    file = tmp_path / "recording.toml"
+    file.write_text(
+        f"""format = 1
+rate_hz = 500.0
+[twin]
+kind = "state_space"
+parameters = {{ A = [[-10.0]], B = [[1.0, 2.0]], C = [[1.0]] }}
+{drives}[[channels]]
+column = "y"
+role = "output"
+signal = "y"
+unit = "m"
+noise_rms = 1e-3
+"""
+    )
+    bench = {"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}
+    with pytest.raises(
+        InputError, match="plays one voltage, and 2 inputs are planned; add --input left or --input right"
+    ):
+        plan_for(file, report, Asked(Wish(amplitude=1.0), bench=bench))
+
+
 def test_a_report_of_another_twin_or_without_a_group_is_refused(recorded: Path, report: dict[str, Any]):
     with pytest.raises(InputError, match="the report is of a state_space"):
         plan_for(recorded, {**report, "twin": "state_space"}, Asked())

@@ -159,6 +159,11 @@ def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Prog
     """Design the input that splits the first group of a report that can be fitted. Raises InputError without one."""
     where = open_situation(path, asked)
     limits = limits_of(where, asked)
+    if asked.bench is not None and len(limits) > 1:
+        volts = " or --input ".join(s for s in limits if where.template.unit[s] == "V")
+        raise InputError(
+            f"{path}: a program plays one voltage, and {len(limits)} inputs are planned; add --input {volts}"
+        )
     floors = noise_of(report)
     sigma = {o: where.noise(o, floors) for o in where.template.outputs}
     check_report(where.template, report)
