@@ -31,7 +31,7 @@ from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
 from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_ERROR
 from sim_devices.physics.saturation import SATURATION
-from sim_devices.physics.scale import SCALE_ERROR
+from sim_devices.physics.scale import SCALE_ERROR, ZERO_ERROR
 from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.spring import CLEARANCE, COGGING_FORCE, CUBIC_STIFFNESS, GRAVITY_LOAD
@@ -86,6 +86,7 @@ _ALL = (
     ONE_SIDED_CONDUCTION,
     CONSTANT_LOAD,
     SCALE_ERROR,
+    ZERO_ERROR,
 )
 
 

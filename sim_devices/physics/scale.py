@@ -1,8 +1,10 @@
-"""A gain that is wrong: of a sensor, an amplifier or an actuator."""
+"""A gain that is wrong, of a sensor, an amplifier or an actuator, and the zero of a sensor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+
+import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 
@@ -29,5 +31,22 @@ SCALE_ERROR = Effect(
     report=_report,
     vanishes_with=(("gain_error",),),
     proportional=True,
+    shifts_line=True,
+)
+
+ZERO_ERROR = Effect(
+    name="zero_error",
+    summary="the zero of a sensor is another",
+    kind="add",
+    stages=("sensor",),
+    sites=("output",),
+    parts=lambda settings: Parts((), (Parameter("zero", "{out}"),)),
+    equation=r"y = x + y_0",
+    source="IEEE Std 1293-2018, section on the model equation: bias",
+    excitation="motion around more than one place, in a simulation that knows where zero is",
+    confusable_with=("constant_load", "step_shift", "thermal_drift"),
+    basis=lambda x, ctx, q, settings: np.ones((x.size, 1)),
+    report=lambda p, settings, scale: (Human("zero", float(p[0]), "{out}"),),
+    driven=False,
     shifts_line=True,
 )

@@ -50,4 +50,5 @@ NAMES = (
     "one_sided_conduction",
     "constant_load",
     "scale_error",
+    "zero_error",
 )

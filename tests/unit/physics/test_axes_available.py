@@ -20,7 +20,7 @@ def test_a_turn_needs_an_axis() -> None:
 def test_effects_of_other_axes_depend_on_signals_and_courses_in_time_do_not() -> None:
     independent = {n for n in EFFECTS if EFFECTS[n].is_independent}
     lines = {"mains_interference", "vibration"}
-    assert independent == lines | {"thermal_drift", "step_shift", "random_walk", "spikes"}
+    assert independent == lines | {"thermal_drift", "step_shift", "random_walk", "spikes", "zero_error"}
 
 
 def test_iron_changes_two_axes_by_one_figure() -> None:

@@ -178,7 +178,7 @@ def _scale(s: Slot, x: str, d: str) -> str:
 
 
 def _zero(s: Slot, x: str, d: str) -> str:
-    return f"{x} + {s.at('load')}"
+    return f"{x} + {s.at(s.placed.parts.weights[0].name)}"
 
 
 def _quantization(s: Slot, x: str, d: str) -> str:
@@ -424,6 +424,7 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "channel_delay": _delay,
     "constant_load": _zero,
     "scale_error": _scale,
+    "zero_error": _zero,
 }
 """Writers of the effects of a signal path. ``FORCES`` has those of forces inside an equation of motion."""
 
