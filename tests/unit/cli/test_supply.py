@@ -7,7 +7,7 @@ from email.message import Message
 from importlib.metadata import Distribution
 from typing import Any
 
-from tools.research.supply.audit import CONSTRAINTS, audited, findings, verdict
+from tools.research.supply.audit import CONSTRAINTS, audited, findings, statement, verdict
 from tools.research.supply.licences import PYPROJECT, declared, page, parts
 
 
@@ -74,6 +74,13 @@ def test_only_a_vulnerability_with_a_repair_fails_the_audit():
 
 def test_what_the_database_does_not_know_is_not_audited():
     assert audited(REPORT) == 3
+
+
+def test_an_audit_of_no_package_is_no_clean_result():
+    """An index without the database of PyPI answered "not found" for each: this read as no vulnerabilities."""
+    none = {"dependencies": [{"name": n, "skip_reason": "Dependency not found on PyPI"} for n in ("one", "two")]}
+    assert statement("installed", none).startswith("installed: audit skipped: ")
+    assert statement("installed", REPORT) == "installed: 3 of 4 packages audited, 2 known vulnerabilities"
 
 
 def pins(text: str) -> dict[str, list[str]]:

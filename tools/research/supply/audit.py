@@ -1,8 +1,8 @@
 """Known vulnerabilities of what is installed and of all extras: ``python -m tools.research.supply.audit`` (pip-audit).
 
 Exit status 1 when one of them has a version that repairs it; 0 when there are none, when no repair exists yet (they
-are listed), or when the database cannot be reached (said, and not taken for a result). Packages that the database does
-not know are counted as not audited.
+are listed), or when the database cannot be reached or knows none of the packages (said, and not taken for a result).
+Packages that the database does not know are counted as not audited.
 """
 
 from __future__ import annotations
@@ -41,6 +41,14 @@ def audited(report: Mapping[str, Any]) -> int:
     return sum("skip_reason" not in entry for entry in report["dependencies"])
 
 
+def statement(what: str, report: Mapping[str, Any]) -> str:
+    """Return the line that says how many packages were audited; none audited is no result."""
+    total, known = len(report["dependencies"]), audited(report)
+    if total and not known:
+        return f"{what}: audit skipped: the vulnerability database knows none of {total} packages; is PyPI reachable?"
+    return f"{what}: {known} of {total} packages audited, {len(findings(report))} known vulnerabilities"
+
+
 def verdict(found: Sequence[Finding]) -> int:
     """Return the exit status of the audit: 1 when there is something to do."""
     return int(any(finding.repaired_in for finding in found))
@@ -64,8 +72,7 @@ def audit(what: str, source: Sequence[str]) -> int:
     for finding in found:
         repair = f"repaired in {', '.join(finding.repaired_in)}" if finding.repaired_in else "no repair yet"
         print(f"{finding.package} {finding.version}: {finding.number}, {repair}")
-    total = len(report["dependencies"])
-    print(f"{what}: {audited(report)} of {total} packages audited, {len(found)} known vulnerabilities")
+    print(statement(what, report))
     return verdict(found)
 
 
