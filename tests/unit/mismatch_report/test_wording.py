@@ -129,3 +129,11 @@ def test_why_an_effect_is_not_named_is_said_with_the_figures_that_show_it():
     assert wording.why_withheld(doubtful, fit).startswith(
         "beside what is left unexplained it is too likely to be wrong"
     )
+
+
+def test_a_rest_that_follows_nothing_is_not_said_to_be_above_a_known_floor() -> None:
+    report = replace(missing_physics(), verdict="unexplained", meaning="unknown")
+    assert report.location.depends_on
+    assert wording.meaning(report).startswith("the noise floor is known well enough")
+    alone = replace(report, location=replace(report.location, depends_on=()))
+    assert "follows no recorded signal" in wording.meaning(alone)

@@ -40,6 +40,12 @@ IMITATED = (
     " cannot be re-fitted, and a wrong one can look the same: a twin with its equations (ode) tells the two apart"
 )
 """Meaning of ``place_not_reachable`` where the named effects leave nothing."""
+FOLLOWS_NOTHING = (
+    "the fit holds and every place of this twin was tried, but what is left follows no recorded signal. It may be slow"
+    " noise, a disturbance that is not recorded, or several effects at once: ten seconds with the input at rest show"
+    " what is there without the input"
+)
+"""Meaning of ``unknown`` where the residual depends on nothing that was recorded."""
 UNSURE = 0.75
 """Probability of a name below which an equally good rival is named beside it."""
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
@@ -236,6 +242,8 @@ def hold(report: Report) -> str:
 def meaning(report: Report) -> str:
     """Return the meaning of ``unexplained`` on this recording; "" for the other verdicts."""
     text = IMITATED if leaves_nothing(report) else MEANINGS.get(report.meaning, "")
+    if report.meaning == "unknown" and not report.location.depends_on:
+        text = FOLLOWS_NOTHING
     return f"{text}: {'; '.join(report.trouble)}" if report.trouble and text else text
 
 
