@@ -236,3 +236,10 @@ def test_a_velocity_differs_with_the_direction_of_its_position(tmp_path: Path) -
     places = [p.target for p in sites(make(recording), recording, EFFECTS["direction_dependence"])]
     assert places
     assert all(p.endswith("by direction of angle") for p in places)
+
+
+def test_equations_that_grow_beyond_all_numbers_are_no_crash(tmp_path: Path) -> None:
+    """A search may try a time constant of the wrong sign and next to nothing: the run is not finite, and no error."""
+    recording = recorded(tmp_path, MOTOR, command(), 0.1 * command()[::-1])
+    found = Model(make(recording)).simulate(View.whole(recording), np.array([20.0, -1e-6, 0.0]))["angle"]
+    assert not np.any(np.isfinite(found))

@@ -321,6 +321,10 @@ class OdeTwin(Head):
                 steps = self.exact_steps(run.dt, values)
                 stored(run.lasting, key, steps, steps.ad.nbytes)
 
+        if steps is not None and not np.all(np.isfinite(steps.ad)):
+            # a trial of the search at which the equations grow beyond all numbers within a step
+            return np.full((run.t.size, len(self.state_list)), np.nan)
+
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
             if steps is not None:
                 return steps.run(x0, u, first, stop)
