@@ -14,16 +14,16 @@ PAGE = Path("docs/data.md")
 _HEAD = """# Public recordings
 
 Made by `python -m tools.research.reports.data_page --out docs/data.md`; do not edit. These recordings are other
-people's: none is part of this project, and what they ask for (licence, citation) is yours to keep.
+people's. None is part of this project. Keep to the licence of each, and cite what its authors ask for.
 
 ```
 micron data list                # names, sizes, licences, what is here already
 micron data fetch emps          # to the cache, with a checksum (extra `data`)
 ```
 
-Files are kept in `~/.cache/micron-bench/data/NAME` (`XDG_CACHE_HOME` holds; `MICRON_DATA` names another folder), as
-their repository has them at one commit. A file whose SHA-256 is not the listed one is not kept. Without a network, one
-message says which file to put where; `--mirror URL` takes `URL/NAME/FILE` from a server of your own.
+Files are kept in `~/.cache/micron-bench/data/NAME` (or under `XDG_CACHE_HOME`, or in the folder that `MICRON_DATA`
+names), as their repository has them at one commit. A file whose SHA-256 is not the listed one is not kept. Without a
+network, one message says which file to put where; `--mirror URL` takes `URL/NAME/FILE` from a server of your own.
 
 `.csv` and `.mat` files among them are described by `micron mismatch new FILE` ([your own data](own-data.md)). The
 folders that the tests use (`shared_data`) hold the same measurements re-packed, one array per column, with a
@@ -47,7 +47,9 @@ def page() -> str:
 
 def _row(s: PublicSet) -> str:
     origin = f"[{s.repository.split('/')[-1][:40]}](https://github.com/{s.repository}/tree/{s.commit})"
-    return f"| `{s.name}` | {s.title} | {s.licence} | {len(s.files)} files, {s.bytes / 1e6:.1f} MB | {origin} |"
+    size = f"{s.bytes / 1e6:.1f} MB" if s.bytes >= 1e5 else f"{s.bytes / 1e3:.0f} kB"
+    files = "1 file" if len(s.files) == 1 else f"{len(s.files)} files"
+    return f"| `{s.name}` | {s.title} | {s.licence} | {files}, {size} | {origin} |"
 
 
 def main() -> None:
