@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 RK_ERROR = 1e-6
 """Largest change of an output, as a share of its range, by which half the step may differ."""
 MOST_RK_STEPS = 64
+MOST_UPDATES = 100
+"""Largest number of updates of discrete states at the start."""
 
 
 class FmuError(ValueError):
@@ -160,6 +162,8 @@ class OpenFmu:
                     self.rk_steps = n
                     return finer
                 found = finer
+        except FmuError:
+            raise
         except Exception as error:
             raise FmuError(f"the FMU stopped ({_line(error)})") from error
         raise FmuError(
@@ -191,8 +195,12 @@ class OpenFmu:
         fmu.enterInitializationMode()
         fmu.setReal(to, u[0].tolist())
         fmu.exitInitializationMode()
-        while fmu.newDiscreteStates()[0]:
-            pass
+        for _ in range(MOST_UPDATES):
+            more, _, _, _, timed, _ = fmu.newDiscreteStates()
+            if timed:
+                raise FmuError("it has events in time, which are not met: export for co-simulation")
+            if not more:
+                break
         fmu.enterContinuousTimeMode()
         n_x = int(self.description.numberOfContinuousStates)
         at, rates = (ctypes.c_double * n_x)(), (ctypes.c_double * n_x)()

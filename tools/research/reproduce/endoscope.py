@@ -102,7 +102,7 @@ def settling() -> list[Row]:
             "equal",
             "exact",
             tolerance=0.05,
-            why="the implicit rule (3.30) lags by half a sample, which is little of so long a tau",
+            why="the implicit rule (3.30) lags by half a sample: 63.03 % at 1 s, where this row stood until it missed",
         )
     )
     return rows
