@@ -70,7 +70,7 @@ class View:
             counts = at >= first
             if not self.fit and not self.period:
                 for s in self.recording.segments:
-                    counts &= (at < s) | (at >= s + self.init)
+                    counts[max(s - a, 0) : max(s + self.init - a, 0)] = False
             out.append(counts)
         return np.concatenate(out)
 

@@ -160,6 +160,20 @@ def test_a_held_out_block_does_not_see_its_output() -> None:
     assert not view.scored(model.twin)[:30].any()
 
 
+def test_samples_behind_every_start_are_not_scored() -> None:
+    """A segment within a range is scored from ``init`` samples on, and one in another range changes nothing."""
+    rec = replace(axis(), segments=(300, 790, 900))
+    twin = make(rec)
+    view = View(rec, ((100, 400), (780, 800), (905, 950)), 30)
+    at = view.index
+    behind = [(at >= s) & (at < s + 30) for s in (0, *rec.segments)]
+    begins = np.repeat([100, 780, 905] if twin.restart else [0, 0, 0], [300, 20, 45])
+    expected = ~np.any(behind, axis=0) & (at >= begins + 30)
+    np.testing.assert_array_equal(view.scored(twin), expected)
+    assert expected.any()
+    assert not expected.all()
+
+
 def test_memory_of_a_block_comes_from_earlier_inputs() -> None:
     rec = piezo()
     model = Model(make(rec), [place(rec, "backlash")])

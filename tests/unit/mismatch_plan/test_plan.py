@@ -17,7 +17,7 @@ from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
 from tools.mismatch.plan.limits import Wish, parse_band, settle_limits
-from tools.mismatch.plan.models import Rival, distance, evidence, separation
+from tools.mismatch.plan.models import Rival, distance, evidence, pairs_of, separation, separations
 from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect
 from tools.mismatch.plan.separable import separable
 from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, situation, with_outputs
@@ -150,6 +150,32 @@ def test_a_floor_ends_a_comparison_early_and_changes_nothing_above_it(recorded: 
     whole = separation(course, pair, SIGMA, thorough=True)
     assert separation(course, pair, SIGMA, floor=0.5 * whole, thorough=True) == pytest.approx(whole, rel=1e-3)
     assert separation(course, pair, SIGMA, floor=2.0 * whole, thorough=True) <= 2.0 * whole
+
+
+def test_the_closest_of_several_pairs_decides_first(recorded: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pairs that are far apart cost no thorough re-fit where the closest one rules an input out."""
+    where = situation(recorded)
+    apart = {"ab": 9.0, "ac": 3.0, "bc": 6.0}
+    asked: list[tuple[str, bool]] = []
+
+    def known(course: Any, a: Rival, b: Rival, *_: Any, thorough: bool) -> float:
+        pair = "".join(sorted((a.name, b.name)))
+        asked.append((pair, thorough))
+        return apart[pair]
+
+    monkeypatch.setattr("tools.mismatch.plan.models.distance", known)
+    pairs = pairs_of([Rival(n, (), np.zeros(0)) for n in "abc"])
+    course = where.course(dict(where.template.inputs))
+    assert separations(course, pairs, SIGMA, thorough=True) == pytest.approx({"a / b": 9.0, "a / c": 3.0, "b / c": 6.0})
+    asked.clear()
+    assert separations(course, pairs, SIGMA, floor=3.5, thorough=True) == pytest.approx({"a / c": 3.0})
+    assert not any(careful for _, careful in asked)
+    asked.clear()
+    assert separations(course, pairs, SIGMA, floor=3.5, thorough=True) == pytest.approx({"a / c": 3.0})
+    assert {pair for pair, _ in asked} == {"ac"}
+    asked.clear()
+    assert min(separations(course, pairs, SIGMA, floor=2.0, thorough=True).values()) == pytest.approx(3.0)
+    assert [pair for pair, careful in asked if careful] == ["ac", "ac", "bc", "bc", "ab", "ab"]
 
 
 def test_a_model_that_begins_at_rest_is_at_no_distance_from_itself_on_an_input_that_repeats(tmp_path: Path):

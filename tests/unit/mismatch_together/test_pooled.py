@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_together.test_together import write
 from tools.mismatch.engine.fit import fit, fit_base
-from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.pose import Posed, prepared
 from tools.mismatch.infer.constants import learned
-from tools.mismatch.infer.pooled import PooledStore, folds_of, pooled
+from tools.mismatch.infer.pooled import CARRIED, PooledStore, folds_of, pool, pooled
 from tools.mismatch.infer.run import infer
+from tools.mismatch.infer.search import search
 from tools.mismatch.together import load_together
 
 
@@ -64,3 +66,31 @@ def test_an_effect_that_two_of_nine_recordings_show_counts_in_both_parts(tmp_pat
     assert best.names & {"saturation", "static_nonlinearity", "dead_zone"}
     again = fit(inferred.found.store.problem, base.model, [base.theta])
     assert inferred.found.store.score(best) > inferred.found.store.score(inferred.found.store.scored(again))
+
+
+def test_a_search_is_forgotten_when_its_best_sets_are_pooled(tmp_path: Path) -> None:
+    """The caches and fits of a search are freed, and no score depends on them."""
+    joined = load_together([write(tmp_path / f"day{k}", k, n=600) for k in range(4)])
+    problem, raw, base = prepared(joined, 0.3, 0, False)
+    effects = tuple(EFFECTS[n] for n in ("backlash", "saturation", "hysteresis"))
+    posed = Posed(joined, effects, problem, raw, base, {})
+    found = search(problem, base, effects, learned())
+    searched = found.store.problem
+    assert searched.view.memo
+    assert any(t.fitted for t in found.first)
+    expected = PooledStore(
+        pooled(searched), fit(pooled(searched), base.model, [found.store.base.fitted.theta], iterations=15), learned()
+    )
+    for s in [s for s in found.store.ranked() if s.placed][:CARRIED]:
+        expected.put(fit(pooled(searched), s.fitted.model, [s.fitted.theta], iterations=15))
+    after, now = pool(found, posed)
+    assert after.store.sets.keys() == expected.sets.keys()
+    assert len(expected.sets) > 1
+    assert [after.store.score(s) for s in after.store.sets.values()] == [
+        expected.score(s) for s in expected.sets.values()
+    ]
+    assert now.problem is after.store.problem
+    assert not searched.view.memo
+    assert not searched.fit_view.memo
+    assert not found.store.sets
+    assert not any(t.fitted for t in after.first)

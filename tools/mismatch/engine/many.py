@@ -127,11 +127,12 @@ def part_estimates(problem: Problem, fitted: Fit, which: Sequence[int]) -> tuple
     rows = problem.fit_rows
     outputs = problem.twin.outputs
     left = np.concatenate([fitted.residual[o][rows] / problem.sigma(o) for o in outputs])
-    sample = np.tile(problem.index[rows], len(outputs))
+    sample = problem.index[rows]
     delta = np.zeros((len(problem.recording.parts), fitted.theta.size))
     error = np.zeros_like(delta)
-    for k, part in enumerate(problem.recording.parts):
-        inside = (sample >= part.start) & (sample < part.stop)
+    for i, part in enumerate(problem.recording.parts):
+        one, other = np.searchsorted(sample, (part.start, part.stop))
+        inside = np.concatenate([np.arange(one, other) + k * rows.size for k in range(len(outputs))])
         a, r = columns[inside], left[inside]
         size = np.linalg.norm(a, axis=0)
         seen = np.flatnonzero(size > 0)
@@ -145,7 +146,7 @@ def part_estimates(problem: Problem, fitted: Fit, which: Sequence[int]) -> tuple
         variance = float(rest @ rest) / (r.size - seen.size) * (1 + rho) / (1 - rho)
         spread = np.sqrt(variance * np.sum((vt[keep].T / s[keep]) ** 2, axis=1)) / size[seen]
         at = np.array(which)[seen]
-        delta[k, at], error[k, at] = step, spread
+        delta[i, at], error[i, at] = step, spread
     return delta, error
 
 

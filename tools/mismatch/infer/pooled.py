@@ -15,11 +15,13 @@ import numpy as np
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.many import everything
+from tools.mismatch.engine.pose import Posed
 from tools.mismatch.engine.problem import Array, Problem
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.split import Split, cut, leave_out
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.search import Found
 from tools.mismatch.infer.store import Scored, Store
 from tools.mismatch.simulate import Model
 
@@ -97,15 +99,33 @@ class PooledStore(Store):
         return replace(fitted, residual=residual, ok=ok)
 
 
-def pool(store: Store, jobs: int = 1) -> PooledStore:
-    """Return the best sets of a search, fitted to all recordings and scored on each."""
-    problem = pooled(store.problem)
+def pool(found: Found, posed: Posed, jobs: int = 1) -> tuple[Found, Posed]:
+    """Return the best sets of a search, fitted to all recordings and scored on each, and ``posed`` with their problem.
 
-    def again(s: Scored) -> Fit:
-        return fit(problem, s.fitted.model, [s.fitted.theta], iterations=15)
+    The search ends here: its caches, and the fits of its trials, would be most of the memory of a hundred recordings.
+    """
+    store, problem = found.store, pooled(found.store.problem)
+    best = [s.fitted for s in store.ranked() if s.placed][:CARRIED]
+    for searched in (store.problem, posed.problem):
+        forget(searched)
 
-    out = PooledStore(problem, again(store.base), store.constants, store.events, jobs)
+    def again(fitted: Fit) -> Fit:
+        return fit(problem, fitted.model, [fitted.theta], iterations=15)
+
+    out = PooledStore(problem, again(store.base.fitted), store.constants, store.events, jobs)
     out.seen = dict(store.seen)
-    for s in [s for s in store.ranked() if s.placed][:CARRIED]:
-        out.put(again(s))
-    return out
+    store.sets.clear()
+    store.eventful.clear()
+    for fitted in best:
+        out.put(again(fitted))
+    return Found(out, tuple(replace(t, fitted=None) for t in found.first)), replace(posed, problem=problem)
+
+
+def forget(problem: Problem) -> None:
+    """Empty the caches of the views of a problem, and of its opening."""
+    made = vars(problem)
+    for view in (made.get("view"), made.get("fit_view")):
+        if view is not None:
+            view.memo.clear()
+    if made.get("opening") is not None:
+        forget(made["opening"])

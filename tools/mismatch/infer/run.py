@@ -57,7 +57,7 @@ def infer(
         found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
         if kept.parts:
             with np.errstate(all="ignore"):
-                found = replace(found, store=pool(found.store, jobs))
+                found, posed = pool(found, posed, jobs)
     return Inferred(posed, found, recording, unsealed)
 
 

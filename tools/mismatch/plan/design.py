@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.mismatch.plan.limits import Limits
-from tools.mismatch.plan.models import Rival, separation
+from tools.mismatch.plan.models import Rival, pairs_of, separation, separations
 from tools.mismatch.plan.situation import Situation
 from tools.mismatch.plan.waveforms import FAMILIES, LIBRARY, SIZE, draw, mean_square, random_multisine
 from tools.mismatch.recording import Array
@@ -35,7 +35,8 @@ ENERGIES_SEED = 77
 class Plan:
     """Holds a planned input ``waves[signal]`` (n,) and the least separation of any two rivals in standard deviations.
 
-    It also has the median of that separation for random multisines of equal energy; ``description`` names the family.
+    It also has the median of that separation for random multisines of equal energy; ``description`` names the family;
+    ``pairs`` is the separation of each pair, the closest first.
     """
 
     waves: Mapping[str, Array]
@@ -54,6 +55,8 @@ class _Point:
     z: NDArray[np.float64]
     value: float
     name: str = ""
+    exact: bool = True
+    """False if ``value`` is only a bound, which ruled the point out as a finalist."""
 
 
 def design(
@@ -74,6 +77,7 @@ def design(
     rng = np.random.default_rng(seed)
     done = 0
     signals = tuple(limits)
+    pairs = pairs_of(rivals)
 
     def waves(family: str, z: NDArray[np.float64]) -> dict[str, Array]:
         parts = np.split(z, len(signals))
@@ -84,7 +88,8 @@ def design(
         done += 1
         if progress is not None:
             progress("inputs", done, evaluations)
-        return separation(where.course(waves(family, z)), rivals, sigma, QUICK, floor, thorough=True)
+        found = separations(where.course(waves(family, z)), pairs, sigma, QUICK, floor, thorough=True)
+        return min(found.values())
 
     named = [(name, family, np.tile(z, len(signals))) for name, (family, z) in LIBRARY.items()]
     drawn = [("", f, rng.random(SIZE[f] * len(signals))) for f in FAMILIES for _ in range(RANDOM_PER_FAMILY)]
@@ -92,12 +97,13 @@ def design(
     for name, family, z in (*named, *drawn):
         # the value of a point that cannot be a finalist is a bound
         floor = points[FINALISTS - 1].value if len(points) >= FINALISTS else -1.0
-        points.append(_Point(family, z, value(family, z, floor), name))
+        found = value(family, z, floor)
+        points.append(_Point(family, z, found, name, found > floor))
         points.sort(key=lambda p: -p.value)
     ends = points[:FINALISTS]
     share = max(0, evaluations - done) // REFINED
     for start in _unlike(points, REFINED) if share else ():
-        now, step = replace(start, value=value(start.family, start.z)), 0.2
+        now, step = start if start.exact else replace(start, value=value(start.family, start.z)), 0.2
         for _ in range(share):
             z = now.z + step * rng.standard_normal(now.z.size)
             z = np.abs(z) % 2.0
@@ -108,23 +114,21 @@ def design(
             else:
                 step = max(step * 1.5**-0.25, 0.01)
         ends.append(now)
-    # an incomplete search overestimates an input, so the finalists are followed to convergence
-    top, best = -1.0, ends[0]
-    for p in ends:
-        course = where.course(waves(p.family, p.z))
-        found = separation(course, rivals, sigma, FULL, top, thorough=True)
-        if found > top:
-            top, best = found, p
+    # an incomplete search overestimates an input, so the finalists are followed to convergence, the best first
+    top, best, apart = -1.0, ends[0], dict[str, float]()
+    for p in sorted(ends, key=lambda p: -p.value):
+        found = separations(where.course(waves(p.family, p.z)), pairs, sigma, FULL, top, thorough=True)
+        if min(found.values()) > top:
+            top, best, apart = min(found.values()), p, found
     chosen = waves(best.family, best.z)
-    pairs = pair_distances(where, rivals, chosen, sigma)
     return Plan(
         chosen,
         dict(limits),
         where.dt,
         best.name or best.family,
-        min(pairs.values()),
+        top,
         random_separation(where, rivals, chosen, limits, sigma, seed=seed, compared=compared),
-        pairs,
+        dict(sorted(apart.items(), key=lambda pair: pair[1])),
         done,
     )
 
@@ -136,18 +140,6 @@ def _unlike(points: Sequence[_Point], count: int) -> list[_Point]:
         if p.family not in {q.family for q in out}:
             out.append(p)
     return out[:count]
-
-
-def pair_distances(
-    where: Situation, rivals: Sequence[Rival], waves: Mapping[str, Array], sigma: Mapping[str, float]
-) -> dict[str, float]:
-    """Return the separation of each unordered pair, by "one / other"."""
-    course = where.course(waves)
-    return {
-        f"{a.name} / {b.name}": separation(course, (a, b), sigma, FULL, thorough=True)
-        for i, a in enumerate(rivals)
-        for b in rivals[i + 1 :]
-    }
 
 
 def random_inputs(

@@ -7,6 +7,7 @@ the expected gain in log likelihood of ``a`` over ``b`` when ``a`` is true.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -93,21 +94,43 @@ def separation(
     course: Recording, rivals: Sequence[Rival], sigma: Mapping[str, float], iterations: int = 8, floor: float = -1.0,
     *, thorough: bool = False,
 ) -> float:  # fmt: skip
-    """Return the least separation of any two rivals (``joint``). Ends early once a pair is not above ``floor``.
+    """Return the least separation of any two rivals (``separations``)."""
+    return min(separations(course, pairs_of(rivals), sigma, iterations, floor, thorough=thorough).values())
 
-    Every re-fit bounds a distance from above, so a thorough one is made only where a quick one lies above ``floor``.
+
+def pairs_of(rivals: Sequence[Rival]) -> list[tuple[Rival, Rival]]:
+    """Return every two of the rivals, in their order."""
+    return list(itertools.combinations(rivals, 2))
+
+
+def separations(
+    course: Recording, pairs: list[tuple[Rival, Rival]], sigma: Mapping[str, float], iterations: int = 8,
+    floor: float = -1.0, *, thorough: bool = False,
+) -> dict[str, float]:  # fmt: skip
+    """Return the separation of every pair (``joint``), by "one / other", or of the first alone that is not above
+    ``floor``.
+
+    Every re-fit bounds a distance from above, so thorough ones are made only where quick ones of all pairs lie above
+    ``floor``, the closest pair first. A pair that is not above it moves to the front of ``pairs``: it is the likeliest
+    to decide the next input, too.
     """
-    least = math.inf
-    for i, a in enumerate(rivals):
-        for b in rivals[i + 1 :]:
-            bounds = [math.inf, math.inf]
-            for careful in (False, True) if thorough and floor > 0.0 else (thorough,):
-                for k, (x, y) in enumerate(((a, b), (b, a))):
-                    bounds[k] = min(bounds[k], distance(course, x, y, sigma, iterations, thorough=careful))
-                    if (found := joint(*bounds)) <= floor:
-                        return found
-            least = min(least, joint(*bounds))
-    return least
+    bounds = [[math.inf, math.inf] for _ in pairs]
+    found = [math.inf for _ in pairs]
+    for careful in (False, True) if thorough and floor > 0.0 else (thorough,):
+        for k in sorted(range(len(pairs)), key=found.__getitem__):
+            a, b = pairs[k]
+            for way, (x, y) in enumerate(((a, b), (b, a))):
+                again = distance(course, x, y, sigma, iterations, thorough=careful)
+                bounds[k][way] = min(bounds[k][way], again)
+                found[k] = joint(*bounds[k])
+                if found[k] <= floor:
+                    pairs.insert(0, pairs.pop(k))
+                    return {_label(a, b): found[k]}
+    return {_label(a, b): d for (a, b), d in zip(pairs, found, strict=True)}
+
+
+def _label(a: Rival, b: Rival) -> str:
+    return f"{a.name} / {b.name}"
 
 
 def joint(forward: float, back: float) -> float:
