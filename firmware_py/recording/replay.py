@@ -34,6 +34,9 @@ class Mismatch:
     recorded: float
     replayed: float
 
+    def __str__(self) -> str:
+        return f"row {self.row}, {self.column}: {self.recorded!r} recorded, {self.replayed!r} replayed"
+
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:

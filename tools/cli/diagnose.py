@@ -42,7 +42,12 @@ class PolicyChoice(StrEnum):
 
 
 def _ask(question: str, yes: bool) -> None:
-    if not yes and not typer.confirm(question, err=True):
+    try:
+        agreed = yes or typer.confirm(question, err=True)
+    except typer.Abort:  # nobody is there who could answer
+        typer.echo(err=True)
+        agreed = False
+    if not agreed:
         raise InputError("you did not agree, so nothing was done; --yes agrees beforehand")
 
 

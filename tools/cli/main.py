@@ -136,6 +136,11 @@ COMMANDS = {
         "Mismatch", "tools.cli.data:data", "List and fetch public recordings, each with its licence and checksum."
     ),
 }
+RESEARCH = (
+    *("hands", "faults", "soak", "endoscope", "reproduce", "placement", "manipulator", "sensing", "tremor"),
+    *("mismatch prove", "mismatch calibrate"),
+)
+"""Commands that only a source tree has."""
 INSIDE: dict[str, dict[str, str]] = {}
 """Commands of research inside a group of the product: group -> name -> where it is."""
 if find_spec("tools.research") is not None:  # a source tree; the wheel does not contain it
@@ -190,7 +195,17 @@ def _rejoin(text: str) -> str:
 
 
 class Helpful(TyperGroup):
-    """Answers a call without arguments with the help on standard output and exit status 0."""
+    """Answers a call without arguments with the help on standard output and exit status 0, and a command that only a
+    source tree has with where it is.
+    """
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        if args[0] not in self.commands:
+            name = " ".join([*ctx.command_path.split()[1:], args[0]])
+            if name in RESEARCH:
+                typer.echo(f"micron: '{name}' is a command of the source tree; an installed wheel lacks it", err=True)
+                ctx.exit(Exit.BAD_INPUT)
+        return super().resolve_command(ctx, args)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if not args:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
 
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.output import check_writable, write_json
+
+if TYPE_CHECKING:
+    from firmware_py.recording.reader import Recording
+
+
+def _reason(opened: Recording) -> str:
+    """Say what probably made the ticks of ``opened`` differ."""
+    tick = int(opened.column("tick")[0]) if "tick" in opened.names else 0
+    if tick > 0:
+        return f"The recording starts at tick {tick} of its run, and what the filters held then is not in it."
+    return "Was the recording made by another revision of the firmware?"
 
 
 def replay(
@@ -41,7 +52,7 @@ def replay(
             say.print(
                 Text.assemble(
                     (f"{report.mismatching_rows} of {report.rows} ticks differ", "bold red"),
-                    f"; the first: {report.first}. Was the recording made by another revision of the firmware?",
+                    f"; the first: {report.first}. {_reason(opened)}",
                 )
             )
         say.print(f"{recorded_s:.1f} s in {took_s:.2f} s: {recorded_s / took_s:.0f} x real time")

@@ -14,5 +14,5 @@ def need(path: Path | str, extra: str, *modules: str) -> tuple[Any, ...]:
     try:
         return tuple(importlib.import_module(name) for name in modules)
     except ImportError as error:
-        package = modules[0].split(".")[0]
+        package = modules[0].split(".")[0].replace("google", "protobuf")  # its module has another name
         raise InputError(f"{path}: needs {package}; install it with: pip install 'micron-bench[{extra}]'") from error

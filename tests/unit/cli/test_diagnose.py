@@ -42,6 +42,9 @@ def test_scan_asks_before_it_writes():
     refused = CliRunner().invoke(app, ["scan", "--virtual", "--probe", "write"], input="n\n")
     assert refused.exit_code == 2
     assert "Write to every address" in refused.output
+    alone = CliRunner().invoke(app, ["scan", "--virtual", "--probe", "write"])
+    assert alone.exit_code == 2
+    assert "micron: you did not agree, so nothing was done; --yes agrees beforehand" in alone.output
 
 
 def test_scope_sees_the_inputs(tmp_path: Path):

@@ -13,7 +13,7 @@ import click
 import pytest
 from typer.testing import CliRunner
 
-from tools.cli.main import COMMANDS, app
+from tools.cli.main import COMMANDS, INSIDE, RESEARCH, Helpful, app
 from tools.cli.reference import micron
 
 EXAMPLE = re.compile(r"Examples?:\s*((?:micron .*\n?\s*)+)")
@@ -160,3 +160,18 @@ assert not {"numba", "scipy", "matplotlib"} & set(sys.modules), sorted(sys.modul
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-300:]
+
+
+def test_the_commands_that_a_wheel_lacks_are_those_of_research():
+    inside = {f"{group} {name}" for group, names in INSIDE.items() for name in names}
+    assert set(RESEARCH) == {name for name, command in COMMANDS.items() if command.panel == "Research"} | inside
+
+
+@pytest.mark.parametrize("name", ["tremor", "mismatch prove"])
+def test_a_command_that_a_wheel_lacks_is_one_message(name: str, capsys: pytest.CaptureFixture[str]):
+    *group, command = name.split()
+    context = click.Context(Helpful(name="micron"), info_name=" ".join(["micron", *group]))
+    with pytest.raises(click.exceptions.Exit) as end:
+        Helpful(name="micron").resolve_command(context, [command, "--json", "x.json"])
+    assert end.value.exit_code == 2
+    assert capsys.readouterr().err == f"micron: '{name}' is a command of the source tree; an installed wheel lacks it\n"

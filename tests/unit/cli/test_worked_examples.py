@@ -7,6 +7,7 @@ one that needs a server of files in ``tests/unit/cli/test_data.py``.
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 from collections.abc import Callable
@@ -194,3 +195,14 @@ def test_the_worked_example_works(name: str, place: Path, request: pytest.Fixtur
         made = place / word
         if word.startswith("out/") and made.suffix:
             assert made.stat().st_size > 0
+
+
+def test_a_part_of_a_run_differs_because_of_what_came_before_it(recording: Path, tmp_path: Path) -> None:
+    part = str(tmp_path / "part.mcap")
+    cut = CliRunner().invoke(app, ["export", str(recording), part, "--raw", "--from", "0.5", "--to", "0.8"])
+    assert cut.exit_code == 0, cut.output
+    done = CliRunner().invoke(app, ["replay", part])
+    assert done.exit_code == 1
+    said = " ".join(done.output.split())
+    assert re.search(r"of 300 ticks differ; the first: row 0, \w+: \S+ recorded, \S+ replayed", said)
+    assert "The recording starts at tick 499 of its run, and what the filters held then is not in it." in said
