@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 
-def install(folder: Path, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ``pip install -e .`` does with the ``pyproject.toml`` of ``folder``: modules and entry points are found."""
+def describe(folder: Path, into: Path) -> Path:
+    """Write the metadata that ``pip install -e .`` makes of the ``pyproject.toml`` of ``folder``. Return their folder."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     name, version = project["name"].replace("-", "_"), project["version"]
     info = into / "installed" / f"{name}-{version}.dist-info"
@@ -19,7 +19,12 @@ def install(folder: Path, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     groups = project["entry-points"].items()
     lines = [f"[{group}]\n" + "\n".join(f"{k} = {v}" for k, v in entries.items()) for group, entries in groups]
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    monkeypatch.syspath_prepend(str(info.parent))
+    return info.parent
+
+
+def install(folder: Path, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ``pip install -e .`` does: modules and entry points are found."""
+    monkeypatch.syspath_prepend(str(describe(folder, into)))
     monkeypatch.syspath_prepend(str(folder))
 
 

@@ -16,14 +16,18 @@ HERE = Path(__file__).parent
 DT_S, SHARE = 0.1, 0.1 / 4.0  # Euler: of the way in one step
 
 
-def recorded(folder, top_um: float = np.inf):
+def write_data(folder, top_um: float = np.inf):
     rng = np.random.default_rng(0)
     power = np.repeat(rng.uniform(0, 10, 24), 50)
     warm = np.zeros_like(power)
     for i in range(1, power.size):
         warm[i] = warm[i - 1] + SHARE * (power[i - 1] - warm[i - 1])
     position = np.minimum(2.1 * warm, top_um) + rng.normal(0, 0.01, power.size)
-    np.savez(folder / "data.npz", p=power, z=position)
+    np.savez(f"{folder}/data.npz", p=power, z=position)
+
+
+def recorded(folder, top_um: float = np.inf):
+    write_data(folder, top_um)
     shutil.copy(HERE / "recording.toml", folder)
     few = [EFFECTS["saturation"], EFFECTS["dead_zone"]]
     return diagnose(load(folder), jobs=1, effects=few)
