@@ -33,6 +33,13 @@ def all_methods() -> tuple[Method, ...]:
     return (*METHODS, *sorted(set(offered(ESTIMATORS)) - set(METHODS)))
 
 
+def why_unknown(method: str) -> str:
+    """Say why ``method`` names no estimator here."""
+    if method in _FORMER:
+        return f"'{method}' is an estimator to compare with: only a source tree has it (tools/research)"
+    return f"'{method}' is no estimator; there are: {', '.join(all_methods())}"
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -266,9 +273,7 @@ class TremorConfig(_Table):
     def _known(cls, method: str) -> str:
         if method in METHODS or method in offered(ESTIMATORS):
             return method
-        if method in _FORMER:
-            raise ValueError(f"'{method}' is an estimator to compare with: only a source tree has it (tools/research)")
-        raise ValueError(f"'{method}' is no estimator; there are {', '.join(all_methods())}")
+        raise ValueError(why_unknown(method))
 
     @model_validator(mode="after")
     def _check(self) -> TremorConfig:

@@ -10,7 +10,7 @@ import pytest
 
 
 def describe(folder: Path, into: Path) -> Path:
-    """Write the metadata that ``pip install -e .`` makes of the ``pyproject.toml`` of ``folder``. Return their folder."""
+    """Write the metadata that ``pip install -e .`` makes in ``folder``, and return where they are."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     name, version = project["name"].replace("-", "_"), project["version"]
     info = into / "installed" / f"{name}-{version}.dist-info"

@@ -1,4 +1,4 @@
-"""The guides of ``docs/adding``, typed by a stranger: an empty folder, the files of a wheel, no decision about trust."""
+"""The guides of ``docs/adding``, typed by a stranger: an empty folder, the files of a wheel, nothing trusted yet."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
 from firmware_py.machine.processors import format_processors
 from firmware_py.run_request import RunRequest
-from firmware_py.tremor.config import Method, all_methods
+from firmware_py.tremor.config import Method, all_methods, why_unknown
 from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, ScaleOption, SeedOption, bench_path
@@ -390,12 +390,11 @@ def _status_line(status: dict[str, Any], seconds: float, watch: TipWatch) -> Ren
 
 def estimator_name(name: str) -> Method:
     """Return ``name``. Raises ``InputError`` for a name that is no estimator of the instrument."""
-    known = all_methods()
-    if name in known:
+    if name in all_methods():
         return name
     if name in ("nn", "cascade"):
         raise InputError(
             f"'{name}': the cascade network takes the tip's displacement, steady part and all, and this instrument "
             "senses acceleration, which has none"
         )
-    raise InputError(f"'{name}' is no estimator; there are: {', '.join(known)}")
+    raise InputError(why_unknown(name))

@@ -35,5 +35,5 @@ def test_it_turns_on_over_a_hole():
 
 
 def test_a_name_that_nobody_offers_is_refused():
-    with pytest.raises(BenchError, match=r"'fazor' is no estimator; there are .*phasor"):
+    with pytest.raises(BenchError, match=r"'fazor' is no estimator; there are: .*phasor"):
         TremorConfig.from_dict({"method": "fazor"})

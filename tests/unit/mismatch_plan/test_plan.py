@@ -16,7 +16,7 @@ from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
-from tools.mismatch.plan.limits import Wish, parse_band, settle_limits
+from tools.mismatch.plan.limits import MOST_SAMPLES, Wish, parse_band, settle_limits
 from tools.mismatch.plan.models import Rival, distance, evidence, pairs_of, separation, separations
 from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect
 from tools.mismatch.plan.separable import separable
@@ -97,6 +97,11 @@ def lag_and_delay(where: Situation) -> tuple[Rival, Rival]:
 
 
 SIGMA = {"displacement": NOISE_UM}
+
+
+def test_a_plan_for_a_long_recording_is_as_long_as_a_plan_may_be():
+    box = settle_limits(Wish(), "V", 1 / RATE_HZ, np.sin(np.arange(90_000) / 50), "x", None)
+    assert box.duration_s == pytest.approx(MOST_SAMPLES / RATE_HZ)
 
 
 def test_waveforms_of_every_family_stay_within_the_limits(recorded: Path):

@@ -9,6 +9,8 @@ import pytest
 from firmware_py.tremor import own
 from firmware_py.tremor.config import TremorConfig
 from hal.errors import BenchError
+from tools.cli.run import estimator_name
+from tools.errors import InputError
 
 
 def step(memory: Any, numbers: Any, sample: float, have: bool, out: Any) -> None:
@@ -54,3 +56,5 @@ def test_an_installed_wheel_says_where_a_baseline_is(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("firmware_py.tremor.config.offered", lambda group: {})
     with pytest.raises(BenchError, match=r"'bmflc' is an estimator to compare with: only a source tree has it"):
         TremorConfig.from_dict({"method": "bmflc"})
+    with pytest.raises(InputError, match=r"'bmflc' is an estimator to compare with: only a source tree has it"):
+        estimator_name("bmflc")

@@ -90,7 +90,7 @@ def settle_limits(
         low, high = float(np.min(recorded)), float(np.max(recorded))
         centre = 0.5 * (low + high) if centre is None else centre
         amplitude = 0.5 * (high - low) if amplitude is None else amplitude
-        duration = recorded.size * dt if duration is None else duration
+        duration = min(recorded.size, MOST_SAMPLES) * dt if duration is None else duration
     if bench is not None:
         centre = bench["neutral"] if centre is None else centre
         amplitude = min(bench["high"] - centre, centre - bench["low"]) if amplitude is None else amplitude
