@@ -103,7 +103,8 @@ def _facts(folder: Path) -> dict[str, Any]:
     try:
         facts = json.loads((folder / "golden.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: not a golden transcript ({error}); make one with 'micron capture'") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{folder}/golden.json: no transcript ({why}); make one with 'micron capture'") from error
     if not isinstance(facts, dict) or facts.get("format") != 1:
         raise InputError(f"{folder}/golden.json: format must be 1")
     return facts

@@ -47,9 +47,11 @@ def cut(
 
     A gap is more than ``LONGEST_GAP`` usual steps without a sample that is finite in every column; shorter ones are
     filled by straight lines and counted. A time column may be out of order. Raises RecordingError for a descriptor or a
-    data file that cannot be read, InputError where too little is left.
+    data file that cannot be read, InputError where too little is left or ``out`` holds the recording.
     """
     path = path / "recording.toml" if path.is_dir() else path
+    if out.resolve() == path.resolve().parent:
+        raise InputError(f"{out}: holds the recording itself, and a cut would replace its data; name another folder")
     text = descriptor(path)
     channels = [c for c in text.get("channels", []) if isinstance(c, dict)]
     names = [str(c["column"]) for c in channels if "column" in c]

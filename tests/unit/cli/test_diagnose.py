@@ -137,7 +137,9 @@ def test_a_difference_is_found_on_the_side_where_it_is(
 
 
 def test_what_is_no_transcript_is_bad_input(tmp_path: Path):
-    assert run("capture", "--diff", str(tmp_path)).exit_code == 2
+    done = run("capture", "--diff", str(tmp_path))
+    assert done.exit_code == 2
+    assert "no transcript (No such file or directory); make one" in " ".join(done.output.split())
 
 
 def test_without_a_bench_page_there_is_no_log():

@@ -101,3 +101,12 @@ def test_segments_that_mean_nothing_are_refused(tmp_path: Path, segments: str, m
     folder = write(tmp_path, t, np.sin(t), f"rate_hz = 100.0\nsegments = {segments}")
     with pytest.raises(RecordingError, match=message):
         load(folder)
+
+
+def test_a_cut_does_not_replace_its_recording(tmp_path: Path) -> None:
+    t = np.arange(400) / 100.0
+    folder = write(tmp_path, t, np.sin(t), 'time_column = "t"')
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    with pytest.raises(InputError, match="name another folder"):
+        cut(folder, folder / ".." / folder.name)
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
