@@ -1,4 +1,4 @@
-"""The guides of ``docs/adding``, typed by a stranger: an empty folder, the files of a wheel, nothing trusted yet."""
+"""The guides of ``docs/adding``, and the tutorial, typed by a stranger in an empty folder with a wheel."""
 
 from __future__ import annotations
 
@@ -113,6 +113,27 @@ def test_a_stranger_types_the_guide(name: str, wheel: Path, tmp_path: Path) -> N
             assert done.returncode == 0, said
     assert re.search(SAID[name], said, flags=re.S), said
     assert " passed" in said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_stranger_types_the_tutorial(wheel: Path, tmp_path: Path) -> None:
+    folder, said = tmp_path / "hers", ""
+    environment = stranger(wheel, folder, folder)
+    for _, _, language, text in BLOCK.findall((ROOT / "docs" / "tutorial-mismatch.md").read_text(encoding="utf-8")):
+        if language == "toml":
+            described = folder / "out" / "lab-tremor" / "recording.toml"
+            head, _, rest = described.read_text(encoding="utf-8").partition("[twin]")
+            described.write_text(head + text + rest[rest.index("\n[[channels]]") :], encoding="utf-8")
+            continue
+        done = subprocess.run(
+            ["bash", "-e", "-c", text], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
+        said += done.stdout + done.stderr
+        assert done.returncode == 0, said
+    assert "rate dependent hysteresis" in said
+    assert "safe state reached: run finished" in said
+    assert said.count("Residual on data that no fit has seen") == 2
 
 
 @pytest.mark.slow
