@@ -1,7 +1,8 @@
 """Plays a program of voltages on the outputs in place of the compensation: ``micron run --manual``.
 
-A program is a TOML file: ``format = 1``, ``rate_hz``, ``stacks`` (1 to 3) and ``volts``, one per sample. It is checked
-against the outputs' limits before anything moves; before and after it the outputs are at neutral.
+A program is a TOML file: ``format = 1``, ``rate_hz``, ``stacks`` (1 to 3) and ``volts``, one per sample for all stacks,
+or a list of them for each. It is checked against the outputs' limits before anything moves; before and after it the
+outputs are at neutral.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ APPROACH_S = 0.5
 
 @dataclass(frozen=True)
 class Program:
-    """``volts`` (n,) of ``stacks`` (0 to 2) at ``rate_hz``."""
+    """``volts`` of ``stacks`` (0 to 2) at ``rate_hz``: (n,) the same for all, or (n, stacks)."""
 
     volts: NDArray[np.float64]
     stacks: tuple[int, ...]
@@ -34,7 +35,7 @@ class Program:
     @property
     def seconds(self) -> float:
         """Duration with the way to its first value and back to neutral."""
-        return self.volts.size / self.rate_hz + 4.0 * APPROACH_S
+        return len(self.volts) / self.rate_hz + 4.0 * APPROACH_S
 
 
 def load_program(path: Path) -> Program:
@@ -54,14 +55,16 @@ def load_program(path: Path) -> Program:
     if not isinstance(listed, list) or not stacks or not all(type(s) is int and 1 <= s <= 3 for s in stacks):
         raise BenchError(f"{path}: stacks = {listed!r} must list some of 1, 2 and 3")
     try:
-        volts = np.asarray(table["volts"], np.float64)
+        volts = np.asarray(table["volts"], np.float64).T
     except (TypeError, ValueError):
-        raise BenchError(f"{path}: volts must be a list of numbers") from None
-    if volts.ndim != 1 or volts.size < 2 or not np.all(np.isfinite(volts)):
+        raise BenchError(f"{path}: volts must be a list of numbers, or lists of as many numbers") from None
+    if volts.ndim not in (1, 2) or len(volts) < 2 or not np.all(np.isfinite(volts)):
         raise BenchError(f"{path}: volts must be a list of at least two finite numbers")
-    if volts.size / rate > LONGEST_S:
-        raise BenchError(f"{path}: lasts {volts.size / rate:g} s; at most {LONGEST_S:g} s are played")
-    return Program(volts, tuple(sorted({s - 1 for s in stacks})), float(rate))
+    if volts.ndim == 2 and (volts.shape[1] != len(stacks) or len(set(stacks)) < len(stacks)):
+        raise BenchError(f"{path}: volts has {volts.shape[1]} lists for stacks = {listed!r}; give each stack one")
+    if len(volts) / rate > LONGEST_S:
+        raise BenchError(f"{path}: lasts {len(volts) / rate:g} s; at most {LONGEST_S:g} s are played")
+    return Program(volts, tuple(dict.fromkeys(s - 1 for s in stacks)), float(rate))
 
 
 def check_program(path: Path, program: Program, limits: ActuationConfig) -> None:
@@ -72,7 +75,7 @@ def check_program(path: Path, program: Program, limits: ActuationConfig) -> None
             f"{path}: goes from {low:g} to {high:g} V, and this bench's outputs from {limits.low_V:g} to "
             f"{limits.high_V:g} V; plan it for this bench (micron mismatch plan --bench)"
         )
-    fastest = float(np.max(np.abs(np.diff(program.volts)))) * program.rate_hz
+    fastest = float(np.max(np.abs(np.diff(program.volts, axis=0)))) * program.rate_hz
     if fastest > limits.slew_V_per_s * (1 + 1e-9):
         raise BenchError(f"{path}: moves by {fastest:g} V/s, and this bench's outputs by {limits.slew_V_per_s:g} V/s")
 
@@ -104,7 +107,7 @@ class ProgramDrive(ManualDrive):
         since_s = (now_ns - self._began_ns) * 1e-9 - 2.0 * APPROACH_S
         volts, target = self._program.volts, self._target_V
         k = int(since_s * self._program.rate_hz + 0.5)
-        if since_s >= 0.0 and k < volts.size:
+        if since_s >= 0.0 and k < len(volts):
             target[list(self._program.stacks)] = volts[k]
             return target
         goal = np.full(3, self._neutral_V)

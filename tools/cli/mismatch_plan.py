@@ -53,7 +53,9 @@ def plan(
     size: Annotated[float, typer.Option(min=0.01, help="Effects of this many noise rms are compared.")] = 3.0,
     noise: Annotated[float | None, typer.Option(metavar="RMS", help="Noise of outputs that declare none.")] = None,
     bench: BenchOption = None,
-    stack: Annotated[int | None, typer.Option(min=1, max=3, help="With --bench: move this stack alone.")] = None,
+    stack: Annotated[
+        list[int] | None, typer.Option(min=1, max=3, help="With --bench: move this stack; one for each planned input.")
+    ] = None,
     evaluations: Annotated[int, typer.Option(min=24, help="Inputs that the search tries.")] = 80,
     seed: Annotated[int, typer.Option(min=0, help="Same seed: same plan.")] = 0,
     json_file: JsonOption = None,
@@ -70,10 +72,10 @@ def plan(
     with clear_errors():
         check_writable(json_file)
         check_folder(out)
-        for name, value in (("--out", out), ("--stack", stack)):
+        for name, value in (("--out", out), ("--stack", stack or None)):
             if value is not None and report is None:
                 raise InputError(f"{name} belongs to --report: without one nothing is planned")
-        if stack is not None and bench is None:
+        if stack and bench is None:
             raise InputError("--stack belongs to --bench: it says which stack of the bench the program moves")
         if noise is not None and not 0.0 < noise < 1e9:
             raise InputError(f"--noise {noise:g}: must be a positive number")
@@ -84,7 +86,9 @@ def plan(
 
         limits = None if bench is None else bench_limits(load_bench(bench_path(bench)))
         wish = Wish(amplitude, centre, rate, parse_band(band), duration, rms)
-        asked = planning.Asked(wish, tuple(inputs or ()), noise, None, size, evaluations, seed, limits)
+        asked = planning.Asked(
+            wish, tuple(inputs or ()), noise, None, size, evaluations, seed, limits, tuple(stack or ())
+        )
         say = console() if json_file == "-" else data_console()
         if report is None:
             from tools.mismatch.plan.show import print_prospect
@@ -93,15 +97,10 @@ def plan(
             print_prospect(found, say)
             write_json(found.to_json(), json_file)
             return
-        _plan_for(
-            twin, read_report(report), asked, out=out, on_bench=bench is not None, stack=stack, json_file=json_file
-        )
+        _plan_for(twin, read_report(report), asked, out=out, json_file=json_file)
 
 
-def _plan_for(
-    twin: Path, report: dict[str, Any], asked: Any, *, out: Path | None, on_bench: bool, stack: int | None,
-    json_file: str | None,
-) -> None:  # fmt: skip
+def _plan_for(twin: Path, report: dict[str, Any], asked: Any, *, out: Path | None, json_file: str | None) -> None:
     from rich.progress import BarColumn, Progress, TextColumn
 
     from tools.mismatch.plan import plan as planning
@@ -116,10 +115,9 @@ def _plan_for(
         )
     print_plan(designed, console() if json_file == "-" else data_console())
     if out is not None:
-        stacks = ((stack,) if stack is not None else (1, 2, 3)) if on_bench else None
-        files = write_plan(designed.plan, designed.where, out, stacks)
+        files = write_plan(designed.plan, designed.where, out, designed.stacks)
         draw_plan(designed.plan, designed.where, designed.rivals, dict(designed.sigma), out / PICTURE)
         console().print(f"written: {', '.join(str(f) for f in (*files, out / PICTURE))}", soft_wrap=True)
-        if on_bench:
+        if designed.stacks:
             console().print(f"next: micron run --virtual --manual {shlex.quote(str(out / PROGRAM))}", soft_wrap=True)
     write_json(designed.to_json(), json_file)

@@ -22,9 +22,26 @@ def test_a_program_is_read(tmp_path: Path):
     assert program.volts.tolist() == [50.0, 60.0, 70.0]
 
 
+def test_stacks_may_have_volts_of_their_own(tmp_path: Path):
+    file = tmp_path / "program.toml"
+    file.write_text(
+        GOOD.replace("[1, 3]", "[3, 1]").replace("[50.0, 60.0, 70.0]", "[[50.0, 60.0, 70.0], [50.0, 49.0, 48.0]]")
+    )
+    program = load_program(file)
+    check_program(file, program, ActuationConfig())
+    assert program.seconds == pytest.approx(0.003 + 4 * APPROACH_S)
+    drive = ProgramDrive(0.0, 100.0, 50.0, program)
+    path = np.array([drive.step(5_000_000 + k * 1_000_000).copy() for k in range(2100)])
+    first = round(2 * APPROACH_S * 1000)
+    np.testing.assert_array_equal(path[first : first + 3], [[50.0, 50.0, 50.0], [49.0, 50.0, 60.0], [48.0, 50.0, 70.0]])
+    assert path[-1].tolist() == [50.0, 50.0, 50.0]
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ("[50.0, 60.0, 70.0]", "[[50.0, 60.0]]", "give each stack one"),
+        ("[50.0, 60.0, 70.0]", "[[50.0, 60.0], [70.0]]", "lists of as many numbers"),
         ("format = 1", "format = 2", "not a program"),
         ("rate_hz = 1000.0", "rate_hz = 0", "rate_hz"),
         ("[1, 3]", "[4]", "stacks"),

@@ -18,7 +18,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.plan.design import Plan, design
 from tools.mismatch.plan.limits import MOST_SAMPLES, Wish, parse_band, settle_limits
 from tools.mismatch.plan.models import Rival, distance, evidence, pairs_of, separation, separations
-from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect
+from tools.mismatch.plan.plan import Asked, limits_of, open_situation, plan_for, prospect, stacks_of
 from tools.mismatch.plan.separable import separable
 from tools.mismatch.plan.situation import Situation, noisy, problem_of, simulated, situation, with_outputs
 from tools.mismatch.plan.waveforms import FAMILIES, SIZE, draw, mean_square, random_multisine
@@ -355,11 +355,13 @@ noise_rms = 1e-5
         limits_of(open_situation(file, Asked()), Asked(bench={"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}))
 
 
-def test_a_program_of_the_bench_is_refused_for_two_inputs(tmp_path: Path, report: dict[str, Any]):
+def two_inputs(folder: Path, units: tuple[str, str]) -> Path:
+    """Write a twin of two inputs without data."""
     drives = "".join(
-        f'[[channels]]\ncolumn = "{s}"\nrole = "input"\nsignal = "{s}"\nunit = "V"\n' for s in ("left", "right")
+        f'[[channels]]\ncolumn = "{s}"\nrole = "input"\nsignal = "{s}"\nunit = "{unit}"\n'
+        for s, unit in zip(("left", "right"), units, strict=True)
     )
-    file = tmp_path / "recording.toml"
+    file = folder / "recording.toml"
     file.write_text(
         f"""format = 1
 rate_hz = 500.0
@@ -374,11 +376,37 @@ unit = "m"
 noise_rms = 1e-3
 """
     )
+    return file
+
+
+def test_two_planned_inputs_move_two_stacks(tmp_path: Path):
+    from firmware_py.control.program import load_program
+
+    where, signals = situation(two_inputs(tmp_path, ("V", "V"))), ("left", "right")
+    stacks = stacks_of(where, signals, Asked(stacks=(3, 1)))
+    assert stacks == (3, 1)
+    assert stacks_of(where, signals, Asked()) == (1, 2)
+    assert stacks_of(where, signals[:1], Asked()) == (1, 2, 3)
+    waves: dict[str, Array] = {"left": 50.0 + np.arange(50) / 5.0, "right": 50.0 - np.arange(50) / 10.0}
+    plan = Plan(waves, {}, 1 / 500.0, "ramps", 1.0, 1.0, {}, 1)
+    write_plan(plan, where, tmp_path, stacks)
+    program = load_program(tmp_path / "program.toml")
+    assert program.stacks == (2, 0)
+    np.testing.assert_allclose(program.volts[::2], np.column_stack([waves["left"], waves["right"]]), atol=1e-4)
+
+
+@pytest.mark.parametrize("stacks", [(2,), (1, 1), (1, 2, 3)])
+def test_each_of_two_inputs_has_one_stack(tmp_path: Path, stacks: tuple[int, ...]):
+    where = situation(two_inputs(tmp_path, ("V", "V")))
+    with pytest.raises(InputError, match=r"2 inputs are planned .left, right., and each moves a stack of its own"):
+        stacks_of(where, ("left", "right"), Asked(stacks=stacks))
+
+
+def test_a_program_of_the_bench_is_refused_for_an_input_that_is_no_voltage(tmp_path: Path, report: dict[str, Any]):
+    file = two_inputs(tmp_path, ("V", "N"))
     bench = {"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}
-    with pytest.raises(
-        InputError, match="plays one voltage, and 2 inputs are planned; add --input left or --input right"
-    ):
-        plan_for(file, report, Asked(Wish(amplitude=1.0), bench=bench))
+    with pytest.raises(InputError, match="a program plays volts, and right is in N; add --input left"):
+        stacks_of(situation(file), ("left", "right"), Asked(bench=bench))
 
 
 def test_a_report_of_another_twin_or_without_a_group_is_refused(recorded: Path, report: dict[str, Any]):

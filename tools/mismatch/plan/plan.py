@@ -20,6 +20,9 @@ from tools.mismatch.plan.rivals import groups_of, noise_of, rivals_of
 from tools.mismatch.plan.separable import Separable, channel_gains, separable
 from tools.mismatch.plan.situation import Situation, situation
 
+STACKS = (1, 2, 3)
+"""Stacks of a bench."""
+
 
 @dataclass(frozen=True)
 class Asked:
@@ -33,6 +36,8 @@ class Asked:
     evaluations: int = 80
     seed: int = 0
     bench: Mapping[str, float] | None = None
+    stacks: tuple[int, ...] = ()
+    """Stacks of the bench (1 to 3) that the planned inputs move; none: all for one input, else one for each."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,8 @@ class Designed:
     rivals: tuple[Rival, ...]
     sigma: Mapping[str, float]
     plan: Plan
+    stacks: tuple[int, ...] = ()
+    """Stacks of the bench that the inputs move, in their order; none without a bench."""
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the command."""
@@ -155,15 +162,35 @@ def prospect(path: Path, asked: Asked) -> Prospect:
     )
 
 
+def stacks_of(where: Situation, signals: Sequence[str], asked: Asked) -> tuple[int, ...]:
+    """Return the stacks that a program moves: those of ``asked``, else all for one input and one for each of several.
+
+    Raises InputError for inputs that are not voltages, and if there is not one stack for each of several inputs.
+    """
+    unit = where.template.unit
+    volts = [s for s in signals if unit[s] == "V"]
+    if len(volts) < len(signals):
+        other = next(s for s in signals if unit[s] != "V")
+        raise InputError(
+            f"{where.path}: a program plays volts, and {other} is in {unit[other]};"
+            f" add --input {' --input '.join(volts)}"
+        )
+    if len(signals) == 1:
+        return asked.stacks or STACKS
+    stacks = asked.stacks or STACKS[: len(signals)]
+    if len(stacks) != len(signals) or len(set(stacks)) < len(stacks):
+        raise InputError(
+            f"{where.path}: {len(signals)} inputs are planned ({', '.join(signals)}), and each moves a stack of its"
+            " own; give as many different --stack, or fewer --input"
+        )
+    return stacks
+
+
 def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Progress | None = None) -> Designed:
     """Design the input that splits the first group of a report that can be fitted. Raises InputError without one."""
     where = open_situation(path, asked)
     limits = limits_of(where, asked)
-    if asked.bench is not None and len(limits) > 1:
-        volts = " or --input ".join(s for s in limits if where.template.unit[s] == "V")
-        raise InputError(
-            f"{path}: a program plays one voltage, and {len(limits)} inputs are planned; add --input {volts}"
-        )
+    stacks = stacks_of(where, tuple(limits), asked) if asked.bench is not None else ()
     floors = noise_of(report)
     sigma = {o: where.noise(o, floors) for o in where.template.outputs}
     check_report(where.template, report)
@@ -179,7 +206,7 @@ def plan_for(path: Path, report: Mapping[str, Any], asked: Asked, progress: Prog
             found = design(
                 where, rivals, limits, sigma, evaluations=asked.evaluations, seed=asked.seed, progress=progress
             )
-            return Designed(where, group, tuple(rivals), sigma, found)
+            return Designed(where, group, tuple(rivals), sigma, found, stacks)
     raise InputError(f"{path}: none of the equivalent effects could be fitted to this recording; diagnose it again")
 
 

@@ -33,7 +33,7 @@ def columns(plan: Plan, where: Situation) -> dict[str, Array]:
     return out
 
 
-def write_plan(plan: Plan, where: Situation, folder: Path, stacks: Sequence[int] | None = None) -> list[Path]:
+def write_plan(plan: Plan, where: Situation, folder: Path, stacks: Sequence[int] = ()) -> list[Path]:
     """Write ``input.csv``, ``input.npz`` and, for ``stacks`` of a bench, ``program.toml``; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     table = columns(plan, where)
@@ -45,24 +45,29 @@ def write_plan(plan: Plan, where: Situation, folder: Path, stacks: Sequence[int]
     np.savez_compressed(buffer, **table)  # pyright: ignore[reportArgumentType]
     write_bytes_atomic(folder / NPZ, buffer.getvalue())
     out = [folder / CSV, folder / NPZ]
-    if stacks is not None:
+    if stacks:
         write_text_atomic(folder / PROGRAM, program(plan, stacks))
         out.append(folder / PROGRAM)
     return out
 
 
 def program(plan: Plan, stacks: Sequence[int]) -> str:
-    """Write the first input as a program for ``micron run --manual``: volts of ``stacks`` (1 to 3), tick by tick."""
-    wave = next(iter(plan.waves.values()))
-    n = round(wave.size * plan.dt * PROGRAM_RATE_HZ)
-    volts = np.interp(np.arange(n) / PROGRAM_RATE_HZ, np.arange(wave.size) * plan.dt, wave)
-    lines: list[str] = []
-    for i in range(0, n, 12):
-        lines.append("  " + ", ".join(f"{v:.4f}" for v in volts[i : i + 12]) + ",")
+    """Write the inputs as a program for ``micron run --manual``: volts of ``stacks`` (1 to 3), tick by tick.
+
+    One input moves all of them, several move one each.
+    """
+    lists = ["[\n" + _ticks(wave, plan.dt) + "\n]" for wave in plan.waves.values()]
+    volts = lists[0] if len(lists) == 1 else "[" + ", ".join(lists) + "]"
     return (
         "# Written by micron mismatch plan. Run it: micron run --manual program.toml\n"
-        f"format = 1\nrate_hz = {PROGRAM_RATE_HZ}\nstacks = {list(stacks)}\nvolts = [\n" + "\n".join(lines) + "\n]\n"
+        f"format = 1\nrate_hz = {PROGRAM_RATE_HZ}\nstacks = {list(stacks)}\nvolts = {volts}\n"
     )
+
+
+def _ticks(wave: Array, dt: float) -> str:
+    n = round(wave.size * dt * PROGRAM_RATE_HZ)
+    volts = np.interp(np.arange(n) / PROGRAM_RATE_HZ, np.arange(wave.size) * dt, wave)
+    return "\n".join("  " + ", ".join(f"{v:.4f}" for v in volts[i : i + 12]) + "," for i in range(0, n, 12))
 
 
 def draw_plan(plan: Plan, where: Situation, rivals: Sequence[Rival], sigma: dict[str, float], path: Path) -> None:
