@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from tools.cli.main import COMMANDS, INSIDE, RESEARCH, Helpful, app
@@ -49,6 +50,40 @@ def test_the_example_parses(name: str):
         words = shlex.split(line, comments=True)
         assert tuple(words[1 : len(path) + 1]) == path, line
         assert not refusal(command, name, words[len(path) + 1 :]), line
+
+
+ROOT = Path(__file__).parents[3]
+FENCE = re.compile(r"^ *```[^\n]*\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+
+
+def parse(line: str) -> None:
+    """Parse a line that begins with ``micron``. Raises for a command or an option that is not there."""
+    words = shlex.split(line, comments=True)
+    path, command = next(v for v in ALL.values() if tuple(words[1 : len(v[0]) + 1]) == v[0])
+    command.make_context(words[0], words[len(path) + 1 :])
+
+
+def typed(page: Path) -> list[str]:
+    """Return the commands in the code blocks of a page."""
+    blocks = FENCE.findall(page.read_text(encoding="utf-8"))
+    return [line.strip() for block in blocks for line in block.splitlines() if line.strip().startswith("micron ")]
+
+
+PAGES = [p for p in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")) if typed(p)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_commands_of_a_page_parse(page: Path):
+    for line in typed(page):
+        parse(line)
+
+
+def test_a_command_or_option_that_is_gone_does_not_parse():
+    assert len(PAGES) > 15
+    with pytest.raises(StopIteration):
+        parse("micron nosuch")
+    with pytest.raises(typer.BadParameter.__bases__[0], match="No such option"):
+        parse("micron run --nosuch 1")
 
 
 GROUPS = [name for name, command in micron.commands.items() if hasattr(command, "commands")]
