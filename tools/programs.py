@@ -11,7 +11,17 @@ from typing import Any, cast
 from hal import plugins
 from hal.bench import BenchDescription, named_files, named_packages
 from hal.errors import BenchError
-from hal.trust import allow_name, digest_of, is_decided, is_ours, is_trusted_package, trust_package, trust_program
+from hal.trust import (
+    allow_name,
+    digest_of,
+    is_decided,
+    is_our_package,
+    is_ours,
+    is_trusted_package,
+    package_of,
+    trust_package,
+    trust_program,
+)
 from hal.validation import validate_table
 from tools.errors import InputError
 
@@ -28,6 +38,11 @@ class Program:
 
     def __str__(self) -> str:
         return str(self.file) if self.file is not None else f"package code {self.target}"
+
+    @property
+    def is_ours(self) -> bool:
+        """True for installed code that came with this program, about which there is nothing to decide."""
+        return bool(self.target) and package_of(self.target)[1] is not None and is_our_package(self.target)
 
     @property
     def is_trusted(self) -> bool:

@@ -85,7 +85,7 @@ def trust(
         from tools.programs import Program, named_in
 
         for path in paths:
-            programs = named_in(path)
+            programs = [item for item in named_in(path) if not (isinstance(item, Program) and item.is_ours)]
             for item in programs:
                 is_program = isinstance(item, Program)
                 if not is_program and not allow_outside and not item.is_trusted:
@@ -94,4 +94,4 @@ def trust(
                 item.trust()
                 console().print(f"{item}: may {'run' if is_program else 'be named'}", soft_wrap=True)
             if not programs:
-                console().print(f"{path}: names no program and no file outside its folder", soft_wrap=True)
+                console().print(f"{path}: names no program of others and no file outside its folder", soft_wrap=True)

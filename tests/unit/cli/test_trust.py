@@ -202,6 +202,14 @@ def test_a_bench_names_files_of_its_folder_and_ours(tmp_path: Path) -> None:
         load_bench(path).resolve("a\0b")
 
 
+def test_nothing_is_decided_about_our_own_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bench.toml").write_text((ROOT / "benches" / "imus.toml").read_text())
+    code, said = micron(monkeypatch, "trust", str(tmp_path / "bench.toml"))
+    assert code == 0
+    assert "names no program of others and no file outside its folder" in " ".join(said.split())
+    assert not list(trust.decisions())
+
+
 def test_our_own_examples_need_no_decision() -> None:
     for path in sorted((ROOT / "benches").glob("micron*.toml")):
         assert all(item.is_trusted for item in named_in(path)), path
