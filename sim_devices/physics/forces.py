@@ -11,8 +11,9 @@ import numpy as np
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context
 
-FRICTION = 7
-"""Level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness, lean of a loop."""
+FRICTION = 8
+"""Level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness, lean of a loop, and
+1 if the extra falls with the exponential of the speed, 0 if with that of its square."""
 # cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre, constant force
 SPRING = 10
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
@@ -25,13 +26,14 @@ ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
 def friction_limit(v, sign, row, at):
     """Return the largest friction at speed v in the direction ``sign``: Coulomb, its asymmetry, Stribeck's extra.
 
-    F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3.
+    F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3. With
+    ``row[at + 7]`` the exponent is -|v|/vs (A. Tustin, J. IEE 94 IIA (1947) 143).
     The numbers of the family begin at ``row[at]``.
     """
     f = row[at] + sign * row[at + 1]
     if row[at + 2] != 0.0 and row[at + 3] > 0.0:
-        r = v / row[at + 3]
-        f += row[at + 2] * np.exp(-r * r)
+        r = abs(v) / row[at + 3]
+        f += row[at + 2] * np.exp(-r if row[at + 7] != 0.0 else -r * r)
     return f
 
 

@@ -344,6 +344,22 @@ def _stribeck_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     return {"friction": row}
 
 
+def _tustin_parts(settings: Settings) -> Parts:
+    parts = _stribeck_parts(settings)
+    return replace(parts, nonlinear=(replace(parts.nonlinear[0], name="decay_speed"),))
+
+
+def _tustin_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    v = velocity_of(x, ctx)
+    return np.column_stack([_coulomb_basis(x, ctx, q, settings), -soft_sign(v) * np.exp(-np.abs(v) / q[0])])
+
+
+def _tustin_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = _stribeck_fill(q, w, settings)["friction"]
+    row[7] = 1.0
+    return {"friction": row}
+
+
 def _stribeck_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     speed = settings["speed"][0]
     k = thin(ctx.keep, 8000)
@@ -423,6 +439,24 @@ _STRIBECK_BRISTLES = Effect(
     plain="coulomb_friction",
 )
 
+_TUSTIN = Effect(
+    name="stribeck_friction",
+    summary="friction that falls as motion starts, at first quickly and then slowly",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_tustin_parts,
+    equation=r"m\ddot x = F - \left(F_c + F_s e^{-|\dot x|/v_s}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
+    source="A. Tustin, J. IEE 94 IIA (1947) 143; " + _FRICTION_SOURCE,
+    excitation="slow motion and reversals, beside fast motion",
+    prepare=_no_settings,
+    guess=_stribeck_guess,
+    basis=_tustin_basis,
+    fill=_tustin_fill,
+    report=_stribeck_report,
+    vanishes_with=(("static_friction",),),
+    plain="coulomb_friction",
+)
+
 STRIBECK_FRICTION = Effect(
     name="stribeck_friction",
     summary="friction that falls as motion starts",
@@ -438,7 +472,7 @@ STRIBECK_FRICTION = Effect(
     basis=_stribeck_basis,
     fill=_stribeck_fill,
     report=_stribeck_report,
-    variants=(_STRIBECK_BRISTLES,),
+    variants=(_TUSTIN, _STRIBECK_BRISTLES),
     vanishes_with=(("static_friction",),),
     plain="coulomb_friction",
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.forces import COGGING, FRICTION, SPRING, loop_along
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING, friction_limit, loop_along
 from sim_devices.physics.hysteresis import dahl
 from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 
@@ -101,3 +103,15 @@ def test_a_loop_without_a_lean_is_the_smooth_spring() -> None:
     start = np.zeros(1, np.int64)
     plain = dahl(course - course[0], np.array([0.3]), np.zeros(1), 0.0, start)[:, 0]
     assert loop_along(course - course[0], 0.3, 0.0, start) == pytest.approx(plain, abs=1e-9)
+
+
+@pytest.mark.parametrize(("flag", "falls"), [(0.0, lambda r: np.exp(-r * r)), (1.0, lambda r: np.exp(-r))])
+def test_the_extra_falls_with_the_square_of_the_speed_or_with_the_speed(
+    flag: float, falls: Callable[[float], float]
+) -> None:
+    """Armstrong-Helouvry (1991), eq. 2.3; Tustin (1947)."""
+    row = np.array([1.0, 0.2, 0.5, 0.1, 0.0, 0.0, 0.0, flag])
+    for v in (-0.3, -0.1, 0.0, 0.05, 0.2):
+        sign = -1.0 if v < 0.0 else 1.0
+        expected = 1.0 + sign * 0.2 + 0.5 * falls(abs(v) / 0.1)
+        assert friction_limit(v, sign, row, 0) == pytest.approx(expected, rel=1e-12)

@@ -461,7 +461,11 @@ def _friction(s: Slot) -> ForceCode:
         return ForceCode(limit=f"{level} * (1 - np.exp(-((v / {s.at('full_speed')}) ** 2)))")
     limit = level + (f" + sign * {s.at('asymmetry')}" if has("asymmetry") else "")
     if has("extra"):
-        limit += f" + {s.at('extra')} * np.exp(-((v / {s.at('stribeck_speed')}) ** 2))"
+        if has("decay_speed"):
+            falls = f"-abs(v) / {s.at('decay_speed')}"
+        else:
+            falls = f"-((v / {s.at('stribeck_speed')}) ** 2)"
+        limit += f" + {s.at('extra')} * np.exp({falls})"
     smooth = f" - {s.at('viscous_asymmetry')} * abs(v)" if has("viscous_asymmetry") else ""
     bent = next((n for n in ("presliding", "yield_distance") if has(n)), "")
     return ForceCode(smooth, limit, f"{level} / {s.at(bent)}" if bent else "", s.at("lean") if has("lean") else "")
