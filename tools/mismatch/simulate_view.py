@@ -12,6 +12,7 @@ from sim_devices.physics.effect import Array
 from tools.mismatch.recording import Recording
 from tools.mismatch.steady import steady_period
 from tools.mismatch.twins.base import Run, Twin
+from tools.mismatch.twins.memo import Nearby
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,20 @@ class View:
     fit: tuple[tuple[int, int], ...] = ()
     afresh: bool = False
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
+    nearby: Nearby | None = field(default=None, compare=False, repr=False)
+
+    def near(self) -> View:
+        """Return this view, its caches shared, for one search: its start states are sought near those of its begin."""
+        view = object.__new__(View)
+        view.__dict__.update(self.__dict__, nearby=Nearby())
+        return view
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields without the cache, which another process rebuilds."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "memo"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("memo", "nearby")}
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state, memo={})
+        self.__dict__.update(state, memo={}, nearby=None)
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
@@ -120,4 +128,7 @@ def view_run(twin: Twin, view: View) -> Run:
     setting = view.setting(twin)
     period = 0 if twin.restart else view.period
     afresh = tuple(p.start for p in rec.parts) or (0,)
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting, period, afresh)
+    return Run(
+        rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting, period, afresh,
+        nearby=view.nearby,
+    )  # fmt: skip

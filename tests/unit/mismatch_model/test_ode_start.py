@@ -73,3 +73,44 @@ def test_a_stretch_that_starts_afresh_is_met_by_all_its_samples_and_by_no_other(
     gap[200:220] += 5.0
     beside = replace(recording, outputs={"angle": gap})
     assert left(beside, True) == pytest.approx(left(recording, True), rel=1e-6)
+
+
+def test_runs_of_one_search_start_near_each_other(tmp_path: Path) -> None:
+    """They meet the recording as well as runs by themselves do, and change smoothly with the parameters."""
+    recording, _ = pendulum(tmp_path)
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = -150.0, 40.0
+    view = View(recording, ((40, 262), (501, 700), (760, 900)), 40, afresh=True)
+    near = view.near()
+    first = model.residual(near, theta)["angle"]
+
+    def residual(view: View, step: float) -> np.ndarray:
+        moved = theta.copy()
+        moved[model.slices(0)[1]] *= 1.0 + step
+        return model.residual(view, moved)["angle"]
+
+    alone = residual(View(recording, view.ranges, 40, afresh=True), 4e-3)
+    assert np.mean(residual(near, 4e-3) ** 2) < 1.01 * np.mean(alone**2)
+    bend = [np.max(np.abs(residual(near, 2 * h) - 2 * residual(near, h) + first)) for h in (1e-3, 2e-3)]
+    slope = np.max(np.abs(residual(near, 1e-3) - first))
+    assert 3.0 < bend[1] / bend[0] < 5.0  # a second difference goes with the square of the step
+    assert bend[0] < 0.05 * slope
+
+
+def test_a_run_outside_a_search_is_not_that_of_a_search(tmp_path: Path) -> None:
+    """What a process has run before must not change a result."""
+    recording, _ = pendulum(tmp_path)
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = -150.0, 40.0
+    view = View(recording, ((40, 262), (501, 700)), 40, afresh=True)
+    moved = theta.copy()
+    moved[model.slices(0)[1]] *= 1.05
+    near = view.near()
+    model.simulate(near, theta)
+    model.simulate(near, moved)
+    fresh = View(recording, view.ranges, 40, afresh=True)
+    assert np.array_equal(model.simulate(view, moved)["angle"], model.simulate(fresh, moved)["angle"])

@@ -17,7 +17,7 @@ from scipy.optimize import lsq_linear
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected, Shrunk
 from tools.mismatch.engine.residual import residuals
-from tools.mismatch.engine.trust import fit_loss, stayed, to_search
+from tools.mismatch.engine.trust import belief, fit_loss, stayed, to_search
 from tools.mismatch.placed import Free
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.ode import inside_of
@@ -33,6 +33,8 @@ NEAR = 1.05
 NEAR_INSIDE = 2.0
 """Value of ``NEAR`` for forces inside differential equations, where the first steps from a distant start say little. It
 was set on a motor with friction, where the start that led to the optimum came second by 1.13."""
+COARSE_STEPS_INSIDE = 6
+"""Number of steps of a coarse search of forces inside differential equations, of other searches 4."""
 LAST_ITERATIONS = 4
 """Number of steps on all rows at the end of a long search."""
 
@@ -72,18 +74,28 @@ def _backward(p: Free, v: float) -> float:
     return _inside(p, float(np.exp(min(v, 700.0))) if p.log and p.lo > 0 else v)
 
 
-def _step_size(p: Free, v: float) -> float:
+STEP, STEP_INSIDE = 1e-3, 0.03
+"""Step of a sensitivity, relative to the parameter, and the same where forces act inside differential equations. Bodies
+stick and slip at samples that jump from step to step, and the difference must span many of them."""
+
+
+def _step_size(p: Free, v: float, step: float) -> float:
     if p.log and p.lo > 0:
-        return 1e-3
+        return step
     wide = p.hi - p.lo
-    typical = max(abs(v) * 1e-3, abs(p.scale) * 1e-3)
+    typical = max(abs(v), abs(p.scale)) * step
     return min(typical, 0.01 * wide) if np.isfinite(wide) else typical
+
+
+def forces_inside(model: Model) -> bool:
+    """Return True if forces or flows act inside differential equations."""
+    return inside_of(model.twin) is not None and any(p.site == "feedback" for p in model.placed)
 
 
 def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     """Return ``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
     p = model.parameters[i]
-    z, h = to_search(p, theta[i]), _step_size(p, theta[i])
+    z, h = to_search(p, theta[i]), _step_size(p, theta[i], STEP_INSIDE if forces_inside(model) else STEP)
     shifted = theta.copy()
     shifted[i] = _backward(p, z + h)
     if shifted[i] == theta[i]:
@@ -159,6 +171,7 @@ def search(
     given = jacobian is not None
     model = projected.model
     free = projected.free
+    projected.anew()
     residual, theta = projected.evaluate(theta)
     cost = float(residual @ residual)
     if not free or not np.isfinite(cost):
@@ -192,6 +205,8 @@ def search(
                 break
             trial, solved = projected.evaluate(candidate)
             new = float(trial @ trial)
+            if np.isfinite(new) and new < cost and projected.is_near:
+                trial, solved, new = projected.renewed(trial, solved, below=cost)
             if np.isfinite(new) and new < cost:
                 gain = (cost - new) / max(cost, 1e-300)
                 moved = np.array([to_search(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
@@ -307,16 +322,27 @@ context and may not occur in the first part of a recording.
 
 
 def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tuple[list[tuple[float, Array]], int]:
-    """Return (cost per usual sample, theta), best first, of the best ``tries`` starts after few steps; evaluations."""
+    """Return (cost per usual sample, theta), best first, of the best ``tries`` starts after few steps; evaluations.
+
+    The best on each base comes first: a base that has been re-fitted without the effect may imitate it, and starts
+    there with less.
+    """
+    model = projected.model
+    steps = COARSE_STEPS_INSIDE if forces_inside(model) else 4
+    within = [np.array([_inside(p, v) for p, v in zip(model.parameters, s, strict=True)]) for s in starts]
+    starts = list({s.tobytes(): s for s in within}.values())
     ranked: list[tuple[float, int, Array]] = []
     for i, theta in enumerate(starts[: 3 * tries]):
+        projected.anew()
         residual, solved = projected.evaluate(theta)
         cost = float(residual @ residual)
         ranked.append((cost if np.isfinite(cost) else np.inf, i, solved))
     ranked.sort(key=lambda r: (r[0], r[1]))
+    of_base = {starts[i][: model.n_base].tobytes(): i for _, i, _ in reversed(ranked)}
+    ranked.sort(key=lambda r: r[1] not in of_base.values())
     tried: list[tuple[float, int, Array]] = []
     for _, i, theta in ranked[:tries]:
-        theta, cost = search(projected, theta, 4, 1e-3)
+        theta, cost = search(projected, theta, steps, 1e-3)
         tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
     tried.sort(key=lambda r: (r[0], r[1]))
     size = max(1.0, projected.usual_count)
@@ -430,3 +456,18 @@ def fit_base(problem: Problem) -> Fit:
         found = fit(problem, model, [given.theta], rounds=1)
         left = fit_loss(problem, found.residual)
     return found if found.ok and left <= believed else given
+
+
+def ground_of(problem: Problem, base: Fit) -> Fit:
+    """Return the fit beside which the first effects are sought: the re-fitted ``base``, or the twin as given.
+
+    Physics that is missing bends the parameters that are there. A re-fit that leaves more than noise and moves a
+    parameter by more than the width of its prior says nothing about it, and forces are not found beside it.
+    """
+    if problem.twin.apart or fit_loss(problem, base.residual) < ENOUGH:
+        return base
+    prior = belief(problem, base.model)
+    at = np.array([to_search(p, v) for p, v in zip(base.model.parameters, base.theta, strict=True)])
+    given = as_given(problem)
+    bent = bool(np.any(np.abs(at - prior.centre) > prior.width))
+    return given if bent and given.ok and stayed(problem, given.residual) else base

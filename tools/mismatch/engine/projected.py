@@ -118,6 +118,29 @@ class Projected:
         self._name_parameters()
         self.evaluations = 0
 
+    def anew(self) -> None:
+        """Forget the start states of the search before."""
+        self.view = self.problem.view.near()
+
+    @property
+    def is_near(self) -> bool:
+        """Return True if start states are moved from those at the begin of the search, to first order."""
+        return self.view.nearby is not None and bool(self.view.nearby.begun)
+
+    def renewed(self, trial: Array, theta: Array, *, below: float) -> tuple[Array, Array, float]:
+        """Return residual, theta and cost at a step with its own start states, near which the search goes on.
+
+        If the step was better to first order alone, the search stays where it was, and the cost is infinite.
+        """
+        before = self.view
+        self.anew()
+        residual, solved = self.evaluate(theta)
+        cost = float(residual @ residual)
+        if not cost < below:
+            self.view = before
+            return trial, theta, np.inf
+        return residual, solved, cost
+
     def _name_parameters(self) -> None:
         """Sort the parameters that move ``outputs``: those that are searched, solved, and have a prior."""
         model = self.model

@@ -102,14 +102,15 @@ def bend(problem: Problem, current: Fit) -> Ground:
     samples = problem.index[rows]
     outputs = problem.twin.outputs
     bends = {o: np.zeros((rows.size, len(model.nonlinear))) for o in outputs}
+    view = problem.view.near()
+    base = model.simulate(view, theta)  # the others start near it
     for c, i in enumerate(model.nonlinear):
         p = model.parameters[i]
         h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
         shifted = theta.copy()
         shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
-        for o, y in model.simulate(problem.view, shifted, model.moved_by(i)).items():
-            now = problem.measured[o][rows] - current.residual[o][rows]
-            bends[o][:, c] = (y[rows] - now) / (shifted[i] - theta[i])
+        for o, y in model.simulate(view, shifted, model.moved_by(i)).items():
+            bends[o][:, c] = (y[rows] - base[o][rows]) / (shifted[i] - theta[i])
     energy: dict[str, float] = {}
     if problem.twin.apart:
         design = model.design(problem.view, theta, samples=samples)
@@ -178,7 +179,8 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     """Return (explained share of the mean square, p-value of the F test) of one linear step from ``theta``."""
     outputs = model.together(model.placed[-1].outputs)
     rows = ground.rows
-    design = model.design(problem.view, theta, outputs, ground.samples)
+    view = problem.view.near()
+    design = model.design(view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
     # the design at these parameters contains the simulation
@@ -192,7 +194,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     for j in new_weights:
         other = theta.copy()
         other[j] += 0.05 * model.parameters[j].scale
-        pushed.append(model.simulate(problem.view, other, outputs))
+        pushed.append(model.simulate(view, other, outputs))
     seen = {j for o in outputs for j in design.linear[o]}
     old_linear = [j for j in model.linear if j in seen and model.parameters[j].name in n_old]
     new_linear = [j for j in model.linear if j in seen and model.parameters[j].name not in n_old]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.fit import Fit, ground_of
 from tools.mismatch.engine.pose import hint_of, may_hint
 from tools.mismatch.engine.problem import Hint, Problem
 from tools.mismatch.engine.screen import places
@@ -49,7 +49,10 @@ WORTH_REFINING = 0.2
 
 
 class Search:
-    """Searches the sets of effects of a problem. ``stride`` thins the rows of a candidate's fit."""
+    """Searches the sets of effects of a problem.
+
+    ``stride`` thins the rows of a candidate's fit. ``ground``: the fit beside which the first effects are sought.
+    """
 
     def __init__(
         self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
@@ -58,6 +61,7 @@ class Search:
         self.jobs, self.progress = jobs, progress
         self.effects = tuple(e for e in effects if e.claims is None)
         self.store = Store(problem, base, constants, [e for e in effects if e.claims is not None])
+        self.ground = ground_of(problem, base)
         self.expanded: set[Key] = set()
         self.moves = moves
         self.idle = 0
@@ -215,8 +219,9 @@ class Search:
             if not s.placed or p.effect.test is not None or any(room[o] > least for o in p.outputs)
         ]
         least_fits, most_fits = FITS_LATER if s.placed else FITS
+        beside = s.fitted if s.placed else self.ground
         trials = try_all(
-            self.store.problem, s.fitted, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
+            self.store.problem, beside, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
             what=f"{len(s.names)}", least=least_fits, most=most_fits, effort=self.effort,
         )  # fmt: skip
         if not s.placed:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
 from tools.mismatch.recording import Recording
+from tools.mismatch.twins.memo import Nearby
 
 LEAST_WINDOW = 20
 """Least number of samples that set a start state, in a record that has so many."""
@@ -78,6 +79,7 @@ class Run:
     measured behind effects, linear ones for a linear run; ``about``: an earlier run of these outputs (n,), else
     zeros. ``beside``: what is added behind each output per unit of a weight; start states are read off the rest;
     ``beside_token`` identifies it. ``recorded``: outputs (n,) as recorded, where ``measured`` has been corrected.
+    ``nearby``: start states of the search that this run belongs to.
     """
 
     t: Array
@@ -98,6 +100,7 @@ class Run:
     beside: Mapping[str, Mapping[int, Array]] = field(default_factory=dict[str, Mapping[int, Array]])
     beside_token: tuple[object, ...] = ()
     recorded: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    nearby: Nearby | None = None
 
     def behind_path(self, output: str, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m,) of an output ``y`` (m,) at the samples ``at``; elsewhere it is as ``about``."""

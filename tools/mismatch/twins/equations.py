@@ -17,6 +17,8 @@ from tools.mismatch.twins.affine import is_affine
 from tools.mismatch.twins.feedback import Rows
 from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive, Packed, rates_of, run_equations, run_readings
 
+STATE_STEP = 1e-4
+"""Step of a start state, over its typical size, of which its slopes are taken."""
 LEAST_SHOWN = 3e-4  # least singular value of a fitted combination of start states, relative to the largest
 
 
@@ -186,45 +188,67 @@ def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
     return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
 
 
+Edges = list[tuple[int, int]]
+"""First row of each stretch, and the row behind its last."""
+
+
+def edges_of(rows: NDArray[np.int64], stretches: int) -> Edges:
+    """Return the edges of stretches, of which ``rows`` gives that of each row, in order."""
+    first = np.searchsorted(rows, np.arange(stretches)).tolist()
+    return list(zip(first, [*first[1:], rows.size], strict=True))
+
+
+def start_step(slopes: Array, missed: Array, edges: Edges) -> tuple[Array, Array]:
+    """Return the Gauss-Newton step (stretches, s) of start states and the squares (stretches,) that it should leave.
+
+    ``slopes`` (rows, q, s) of the negative of ``missed`` (rows, q). What the samples do not determine is not moved.
+    """
+    s = slopes.shape[2]
+    columns = [(slopes[a:b].reshape(-1, s), missed[a:b].reshape(-1)) for a, b in edges]
+    gram = np.stack([c.T @ c for c, _ in columns])
+    cross = np.stack([c.T @ y for c, y in columns])
+    whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
+    size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
+    determined = size > LEAST_SHOWN**2 * size[:, -1:]
+    along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
+    turn = np.einsum("kij,kj->ki", ways, np.where(determined, along / np.where(determined, size, 1.0), 0.0))
+    return turn, np.array([np.sum((y - c @ step) ** 2) for (c, y), step in zip(columns, turn, strict=True)])
+
+
+def slopes_of(x0: Array, missed: Array, misses: Callable[[Array], Array], typical: Array) -> Array:
+    """Return the slopes (rows, q, s) of the negative of ``missed`` (rows, q) by each state at the start."""
+    ways = STATE_STEP * typical * np.eye(x0.shape[1])
+    return np.stack([(missed - misses(x0 + way)) / STATE_STEP for way in ways], axis=-1)
+
+
 @np.errstate(over="ignore", invalid="ignore")  # a trial that runs away is no better
 def meet_start(
     x0: Array,
     misses: Callable[[Array], Array],
-    rows: NDArray[np.int64],
+    edges: Edges,
     typical: Array,
     limits: tuple[Array, Array],
     rounds: int = 3,
 ) -> Array:
-    """Fit start states (starts, s) that minimise ``misses`` (rows, q), from ``x0`` on.
+    """Fit start states (stretches, s) that minimise ``misses`` (rows, q), from ``x0`` on.
 
-    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton are
-    made; combinations that the samples do not determine stay at the guess.
+    ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton are made.
     """
-    s, step = x0.shape[1], 1e-4
-    first = np.searchsorted(rows, np.arange(x0.shape[0]))
-    edges = list(zip(first.tolist(), [*first[1:].tolist(), rows.size], strict=True))
+    first = [a for a, _ in edges]
+    of = np.repeat(np.arange(len(edges)), [b - a for a, b in edges])
 
     def together(e: Array) -> Array:
         return np.add.reduceat(e, first, axis=0)
 
     best = misses(x0)
     for _ in range(rounds):
-        slopes = np.stack([(best - misses(x0 + step * typical * np.eye(s)[i])) / step for i in range(s)], axis=-1)
-        columns = [(slopes[a:b].reshape(-1, s), best[a:b].reshape(-1)) for a, b in edges]
-        gram = np.stack([c.T @ c for c, _ in columns])
-        cross = np.stack([c.T @ y for c, y in columns])
-        whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
-        size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
-        determined = size > LEAST_SHOWN**2 * size[:, -1:]
-        along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
-        turn = np.einsum("kij,kj->ki", ways, np.where(determined, along / np.where(determined, size, 1.0), 0.0))
+        turn, foretold = start_step(slopes_of(x0, best, misses, typical), best, edges)
         moved = np.clip(x0 + typical * turn, *limits)
         after = misses(moved)
         was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
         better = now < was
-        foretold = np.array([np.sum((y - c @ step) ** 2) for (c, y), step in zip(columns, turn, strict=True)])
         x0 = np.where(better[:, None], moved, x0)
-        best = np.where(better[rows][:, None], after, best)
+        best = np.where(better[of][:, None], after, best)
         # linear equations need a single step
         if not np.any(better & (now < 0.999 * was) & (now > foretold + 0.001 * was)):
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,3 +32,27 @@ def stored(memo: dict[object, object], key: object, value: object, size: int) ->
         full = 0
     memo[key] = value
     memo["bytes"] = full + size
+
+
+@dataclass(frozen=True)
+class Start:
+    """Holds fitted start states ``x0`` (stretches, s), and how they act on the run from them.
+
+    ``states`` (n, s, s): change of the states by each start state, over its typical size; ``slopes`` (rows, outputs, s)
+    the same of what is measured, weighted, on the samples that set the start.
+    """
+
+    x0: Array
+    states: Array
+    slopes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """Holds the start of a run at the begin of a search, by its stretches; other runs of the search start near it.
+
+    Their start states are moved along the first run's sensitivities, which costs no further run. A search has its own,
+    so that its result does not depend on what the process has run before.
+    """
+
+    begun: dict[bytes, Start] = field(default_factory=dict[bytes, Start])

@@ -19,20 +19,24 @@ from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.equations import (
     LEAST_SHOWN,
     NOTHING,
+    STATE_STEP,
     Equations,
     Inside,
     Linearised,
     Place,
     State,
+    edges_of,
     linearise,
     meet_start,
+    slopes_of,
+    start_step,
 )
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.forced import shot_to_repeat
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
-from tools.mismatch.twins.memo import remember, stored
+from tools.mismatch.twins.memo import Start, remember, stored
 from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive
 
 MOST_SUBSTEPS = 200
@@ -214,7 +218,7 @@ class OdeTwin(Head):
     ) -> dict[str, Signal]:
         """See Twin. Nothing stays linear behind the equations."""
         used = {s: fold(x, theta) for s, x in inputs.items()}
-        key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window)
+        key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window, run.nearby)
         key = (*key, *(x.token for x in used.values()), *((o, p.token) for o, p in run.paths.items()))
         key = (*key, *((f.effect.form, f.target, f.q.tobytes(), f.weights.tobytes(), _settings(f)) for f in forces))
 
@@ -362,53 +366,72 @@ class OdeTwin(Head):
             ss = start_state(steps.ad, rows, run if self.integrates else replace(run, setting=None))
             missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
             return x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
-        # the windows that set the state are simulated alone, one after the other
-        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
-        seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
-        after = np.cumsum(stop - starts)
-        before = after - (stop - starts)
-        rows = np.repeat(np.arange(starts.size), stop - starts)
         weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
-        y = np.column_stack([run.measured[o][seen] for o in self.outputs])
-        part, t = np.ascontiguousarray(u[seen]), run.t[seen]
-
-        def misses(x0: Array) -> Array:
-            x = go(x0, before, after, part, t)
-            return (y - self._behind_paths(run, self.equations.readings(x, part, t, values), seen)) * weight
-
-        x0 = self.as_read(x0, y[before], part[before], t[before], values, reading)
-        x0 = meet_start(x0, misses, rows, self.typical, limits)
-        if run.setting is None or not self.integrates:
-            return go(x0, starts, ends, u, run.t)
-        # then all permitted samples count: the first ones are noisy, and an effect behind may hide the state in them
-        seen = run.setting
-        of = np.searchsorted(starts, seen, side="right") - 1
-        used, rows = np.unique(of, return_inverse=True)
-        y = np.column_stack([run.measured[o][seen] for o in self.outputs])
-
-        def with_some(some: Array) -> Array:
-            every = x0.copy()
-            every[used] = some
-            return every
-
-        tried: list[tuple[Array, Array]] = []
+        all_set = run.setting is not None and self.integrates
+        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
+        first = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
+        seen = run.setting if run.setting is not None and self.integrates else first
+        used, rows = np.unique(np.searchsorted(starts, seen, side="right") - 1, return_inverse=True)
+        edges = edges_of(rows, used.size)
         every = np.arange(run.t.size)
         at = every if run.paths else seen  # what is measured behind effects depends on all that was before
+        measured = np.column_stack([run.measured[o] for o in self.outputs])
         part, t = u[at], run.t[at]
+        tried: list[tuple[Array, Array]] = []
 
-        def misses_all(some: Array) -> Array:
-            x = go(with_some(some), starts, ends, u, run.t)
+        def misses(some: Array) -> Array:
+            start = x0.copy()
+            start[used] = some
+            x = go(start, starts, ends, u, run.t)
             tried.append((some, x))
             readings = self.equations.readings(x[at], part, t, values)
-            return (y - (self._behind_paths(run, readings, every)[seen] if run.paths else readings)) * weight
+            behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
+            return (measured[seen] - behind) * weight
 
-        found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
-        # each stretch starts anew, and has been run from the state that was found
-        out = tried[0][1].copy()
-        for k, i in enumerate(used):
-            x = next(x for some, x in tried if np.array_equal(some[k], found[k], equal_nan=True))
-            out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
-        return out
+        def moved_along(begun: Start, missed: Array, x: Array) -> Array:
+            turn = np.zeros(begun.x0.shape)
+            turn[used], _ = start_step(begun.slopes, missed, edges)
+            turn = (np.clip(begun.x0 + self.typical * turn, *limits) - begun.x0) / self.typical
+            return x + np.einsum("nij,nj->ni", begun.states, np.repeat(turn, ends - starts, axis=0))
+
+        begun = run.nearby.begun.get(starts.tobytes()) if run.nearby is not None else None
+        if begun is not None:
+            x0 = begun.x0
+            return moved_along(begun, misses(x0[used]), tried[0][1])
+        # the windows that set the state are simulated alone, one after the other
+        after = np.cumsum(stop - starts)
+        before = after - (stop - starts)
+        alone, when = np.ascontiguousarray(u[first]), run.t[first]
+
+        def misses_alone(x0: Array) -> Array:
+            x = go(x0, before, after, alone, when)
+            readings = self.equations.readings(x, alone, when, values)
+            return (measured[first] - self._behind_paths(run, readings, first)) * weight
+
+        x0 = self.as_read(x0, measured[starts], u[starts], run.t[starts], values, reading)
+        windows = list(zip(before.tolist(), after.tolist(), strict=True))
+        x0 = meet_start(x0, misses_alone, windows, self.typical, limits)
+        if all_set:
+            # then all permitted samples count: the first ones are noisy, and an effect behind may hide the state there
+            found = meet_start(x0[used], misses, edges, self.typical, limits, rounds=1)
+            # each stretch starts anew, and has been run from the state that was found
+            out = tried[0][1].copy()
+            for k, i in enumerate(used):
+                x = next(x for some, x in tried if np.array_equal(some[k], found[k], equal_nan=True))
+                out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
+            x0[used] = found
+        else:
+            out = go(x0, starts, ends, u, run.t)
+        if run.nearby is None or not np.all(np.isfinite(out)):
+            return out
+        tried.clear()
+        missed = misses(x0[used])
+        slopes = slopes_of(x0[used], missed, misses, self.typical)
+        if not np.all(np.isfinite(slopes)):
+            return out
+        states = np.stack([(x - tried[0][1]) / STATE_STEP for _, x in tried[1:]], axis=-1)
+        run.nearby.begun[starts.tobytes()] = Start(x0, states, slopes)
+        return moved_along(run.nearby.begun[starts.tobytes()], missed, tried[0][1])
 
     def _behind_paths(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""

@@ -26,6 +26,8 @@ from tools.mismatch.twins.program import parse
 
 TABLES = ("states", "equations", "outputs", "offsets", "units", "function", "fixed", "hold")
 """Keys of an ode twin that are not numbers; they stand beside ``parameters`` in ``[twin]``, or inside it."""
+WIDEST = 100.0
+"""Largest factor between a parameter that is searched by its logarithm and the engineer's own value."""
 PROBES = 5
 
 
@@ -135,7 +137,10 @@ def _assembled(
         outputs=tuple(recording.outputs),
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
-        parameters=tuple(Parameter(names[i], str(units_of.get(names[i], "")), scale=scale[names[i]]) for i in free),
+        parameters=tuple(
+            Parameter(n, str(units_of.get(n, "")), *_range(values[i], bends), log=bends, scale=scale[n])
+            for i, n, bends in ((i, names[i], _bends(equations, x, u, values, i)) for i in free)
+        ),
         equations=equations,
         state_list=states,
         signals=signals,
@@ -295,6 +300,31 @@ def _directions(
         of = [p.position for p in places if p.kind in ("motion", "storage") and differs[p.target]]
         out += [(i, j) for j in dict.fromkeys(of)]
     return out
+
+
+def _bends(equations: Equations, x: Array, u: Array, values: Array, i: int) -> bool:
+    """Return True if derivatives or outputs are not linear in a positive parameter, as in a time constant or a mass.
+
+    Its size is searched by the logarithm: beside missing physics it would otherwise run to zero.
+    """
+    if values[i] <= 0.0:
+        return False
+    at = np.linspace(0, x.shape[0] - 1, PROBES).astype(int)
+    some, beside = np.ascontiguousarray(x[at]), np.ascontiguousarray(u[at])
+
+    def changed(factor: float) -> Array:
+        v = values.copy()
+        v[i] *= factor
+        rates = rates_at(equations, some, beside, v)
+        return np.concatenate([rates, equations.readings(some, beside, np.zeros(at.size), v)], axis=1)
+
+    one, half, double = changed(1.0), changed(0.5), changed(2.0)
+    bend, size = double - 3.0 * one + 2.0 * half, np.abs(double) + np.abs(one) + np.abs(half)
+    return bool(np.any(np.abs(bend) > 1e-9 * np.max(size, axis=0)))
+
+
+def _range(value: float, bends: bool) -> tuple[float, float]:
+    return (value / WIDEST, value * WIDEST) if bends else (-np.inf, np.inf)
 
 
 def _flat(into: Mapping[int, Sequence[int]]) -> tuple[float, ...]:
