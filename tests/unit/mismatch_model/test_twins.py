@@ -288,7 +288,7 @@ def test_linear_kernels_equal_python() -> None:
     args = (d.ad, d.g0, d.g1, c, u, starts)
     np.testing.assert_allclose(run_output(*args), run_output.py_func(*args), atol=1e-14)
     rows = (
-        np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0, 0.0]),
+        np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0, 0.0, 1.0]),
         np.array([3.0, 0.5, 2.0, 1.0, 0.1, 0.2, 0.4, 0.05, 0.1, 0.3]),
         np.array([0.1, 0.2, 0.1, 0.0, 0.05, 0.3, -0.1]),
     )

@@ -125,7 +125,7 @@ class Projected:
     @property
     def is_near(self) -> bool:
         """Return True if start states are moved from those at the begin of the search, to first order."""
-        return self.view.nearby is not None and bool(self.view.nearby.begun)
+        return self.view.nearby is not None and bool(self.view.nearby.of_stretches)
 
     def renewed(self, trial: Array, theta: Array, *, below: float) -> tuple[Array, Array, float]:
         """Return residual, theta and cost at a step with its own start states, near which the search goes on.

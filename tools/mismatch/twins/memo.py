@@ -55,4 +55,4 @@ class Nearby:
     so that its result does not depend on what the process has run before.
     """
 
-    begun: dict[bytes, Start] = field(default_factory=dict[bytes, Start])
+    of_stretches: dict[bytes, Start] = field(default_factory=dict[bytes, Start])

@@ -388,16 +388,16 @@ class OdeTwin(Head):
             behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
             return (measured[seen] - behind) * weight
 
-        def moved_along(begun: Start, missed: Array, x: Array) -> Array:
-            turn = np.zeros(begun.x0.shape)
-            turn[used], _ = start_step(begun.slopes, missed, edges)
-            turn = (np.clip(begun.x0 + self.typical * turn, *limits) - begun.x0) / self.typical
-            return x + np.einsum("nij,nj->ni", begun.states, np.repeat(turn, ends - starts, axis=0))
+        def moved_along(nearest: Start, missed: Array, x: Array) -> Array:
+            turn = np.zeros(nearest.x0.shape)
+            turn[used], _ = start_step(nearest.slopes, missed, edges)
+            turn = (np.clip(nearest.x0 + self.typical * turn, *limits) - nearest.x0) / self.typical
+            return x + np.einsum("nij,nj->ni", nearest.states, np.repeat(turn, ends - starts, axis=0))
 
-        begun = run.nearby.begun.get(starts.tobytes()) if run.nearby is not None else None
-        if begun is not None:
-            x0 = begun.x0
-            return moved_along(begun, misses(x0[used]), tried[0][1])
+        nearest = run.nearby.of_stretches.get(starts.tobytes()) if run.nearby is not None else None
+        if nearest is not None:
+            x0 = nearest.x0
+            return moved_along(nearest, misses(x0[used]), tried[0][1])
         # the windows that set the state are simulated alone, one after the other
         after = np.cumsum(stop - starts)
         before = after - (stop - starts)
@@ -430,8 +430,8 @@ class OdeTwin(Head):
         if not np.all(np.isfinite(slopes)):
             return out
         states = np.stack([(x - tried[0][1]) / STATE_STEP for _, x in tried[1:]], axis=-1)
-        run.nearby.begun[starts.tobytes()] = Start(x0, states, slopes)
-        return moved_along(run.nearby.begun[starts.tobytes()], missed, tried[0][1])
+        run.nearby.of_stretches[starts.tobytes()] = Start(x0, states, slopes)
+        return moved_along(run.nearby.of_stretches[starts.tobytes()], missed, tried[0][1])
 
     def _behind_paths(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""
