@@ -67,11 +67,13 @@ SETUPS = (
 
 
 class Run(NamedTuple):
-    """Holds the firmware's own figures of a run, the ``core`` share of its process since the bench was open, and the
-    time in ms that the host took from the machine."""
+    """Holds the firmware's own figures of a run, the ``core`` share of its process since the bench was open, the part
+    of it of its main thread, which also sets up, arms and runs the compiled loop, and the time in ms that the host took
+    from the machine."""
 
     outcome: dict[str, Any]
     core: float
+    main_core: float
     stolen_ms: float
 
     def latency_us(self, name: str) -> float:
@@ -153,7 +155,7 @@ def _spin() -> None:
 
 def run_all(setup: Setup) -> None:
     """Be the firmware of each kind of run, one after another, and print their ``Run`` as JSON."""
-    found: list[tuple[dict[str, Any], float, float]] = []
+    found: list[tuple[dict[str, Any], float, float, float]] = []
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         bench = bench_file(setup, Path(folder))
         for compiled in (True, False):  # everything is compiled or loaded
@@ -164,13 +166,15 @@ def run_all(setup: Setup) -> None:
             began: list[float] = []
 
             def on_open(opened: OpenBench, began: list[float] = began) -> None:
-                began[:] = time.process_time(), time.monotonic(), stolen_ms()
+                began[:] = time.process_time(), time.monotonic(), time.thread_time(), stolen_ms()
 
             request = RunRequest(bench, setup.run_s, pace="realtime", compiled=kind != PYTHON)
             outcome, _ = run_in_process(request, on_open=on_open)
-            core = (time.process_time() - began[0]) / (time.monotonic() - began[1])
+            took_s = time.monotonic() - began[1]
+            core, main_core = (time.process_time() - began[0]) / took_s, (time.thread_time() - began[2]) / took_s
             kept = ("latency", "ticks", "loop", "safe_state", "holds", "commands", "host")
-            found.append(({key: outcome[key] for key in kept if key in outcome}, core, stolen_ms() - began[2]))
+            figures = {key: outcome[key] for key in kept if key in outcome}
+            found.append((figures, core, main_core, stolen_ms() - began[3]))
     print(json.dumps(found, default=str), flush=True)
     os._exit(0)
 
@@ -260,6 +264,11 @@ def core_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
         f"CPU of the firmware's process, {setup.name}, compiled", "self-test in it; recorder and world are others'",
         ours, peer, "Python", "cores", ours / peer, f"<= {CORE_GOAL:g} cores" if must else "-",
         ours <= CORE_GOAL if must else None, must=must, why="what runs beside the thread is Python" if must else "",
+    )  # fmt: skip
+    main = runs[COMPILED].main_core
+    yield Row(
+        f"CPU of the main thread, {setup.name}, compiled", "compiled loop, arming and self-test; the rest is Python",
+        main, ours, "its process", "cores", main / ours,
     )  # fmt: skip
 
 
