@@ -23,7 +23,7 @@ def describe(folder: Path, into: Path) -> Path:
 
 
 def install(folder: Path, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ``pip install -e .`` does: modules and entry points are found."""
+    """Modules and entry points are found, as after ``pip install -e .``."""
     monkeypatch.syspath_prepend(str(describe(folder, into)))
     monkeypatch.syspath_prepend(str(folder))
 

@@ -100,7 +100,7 @@ def test_runs_of_one_search_start_near_each_other(tmp_path: Path) -> None:
 
 
 def test_a_run_outside_a_search_is_not_that_of_a_search(tmp_path: Path) -> None:
-    """What a process has run before must not change a result."""
+    """A result does not depend on what a process has run before."""
     recording, _ = pendulum(tmp_path)
     (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
     model = Model(make(recording), [place])

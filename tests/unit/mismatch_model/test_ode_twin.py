@@ -243,3 +243,28 @@ def test_equations_that_grow_beyond_all_numbers_are_no_crash(tmp_path: Path) -> 
     recording = recorded(tmp_path, MOTOR, command(), 0.1 * command()[::-1])
     found = Model(make(recording)).simulate(View.whole(recording), np.array([20.0, -1e-6, 0.0]))["angle"]
     assert not np.any(np.isfinite(found))
+
+
+def test_what_is_divided_by_is_searched_by_its_size_and_what_may_change_its_sign_is_not(tmp_path: Path) -> None:
+    twin = """
+[twin]
+kind = "ode"
+[twin.states]
+angle = "rad"
+speed = "rad/s"
+[twin.equations]
+angle = "speed"
+speed = "(torque * command - drag * speed - weight * sin(angle + upright)) / inertia + sqrt(leak)"
+[twin.parameters]
+torque = 2.0
+drag = 0.5
+weight = 0.3
+upright = 0.05
+inertia = 0.02
+leak = 0.1
+"""
+    u = command()
+    parameters = {p.name: p for p in make(recorded(tmp_path, twin, u, 2.0 * u)).parameters}
+    assert {name for name, p in parameters.items() if p.log} == {"inertia", "leak"}
+    assert (parameters["inertia"].lo, parameters["inertia"].hi) == pytest.approx((2e-4, 2.0))
+    assert parameters["upright"].lo == -np.inf

@@ -367,10 +367,10 @@ class OdeTwin(Head):
             missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
             return x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
         weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
-        all_set = run.setting is not None and self.integrates
         stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
         first = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
-        seen = run.setting if run.setting is not None and self.integrates else first
+        every_sample = run.setting if self.integrates else None
+        seen = first if every_sample is None else every_sample
         used, rows = np.unique(np.searchsorted(starts, seen, side="right") - 1, return_inverse=True)
         edges = edges_of(rows, used.size)
         every = np.arange(run.t.size)
@@ -411,7 +411,7 @@ class OdeTwin(Head):
         x0 = self.as_read(x0, measured[starts], u[starts], run.t[starts], values, reading)
         windows = list(zip(before.tolist(), after.tolist(), strict=True))
         x0 = meet_start(x0, misses_alone, windows, self.typical, limits)
-        if all_set:
+        if every_sample is not None:
             # then all permitted samples count: the first ones are noisy, and an effect behind may hide the state there
             found = meet_start(x0[used], misses, edges, self.typical, limits, rounds=1)
             # each stretch starts anew, and has been run from the state that was found

@@ -138,8 +138,8 @@ def _assembled(
         units=recording.unit,
         chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
         parameters=tuple(
-            Parameter(n, str(units_of.get(n, "")), *_range(values[i], bends), log=bends, scale=scale[n])
-            for i, n, bends in ((i, names[i], _bends(equations, x, u, values, i)) for i in free)
+            Parameter(n, str(units_of.get(n, "")), *_range(values[i], log), log=log, scale=scale[n])
+            for i, n, log in ((i, names[i], _one_sign(equations, x, u, values, i)) for i in free)
         ),
         equations=equations,
         state_list=states,
@@ -302,10 +302,12 @@ def _directions(
     return out
 
 
-def _bends(equations: Equations, x: Array, u: Array, values: Array, i: int) -> bool:
-    """Return True if derivatives or outputs are not linear in a positive parameter, as in a time constant or a mass.
+def _one_sign(equations: Equations, x: Array, u: Array, values: Array, i: int) -> bool:
+    """Return True if a parameter that is given as positive cannot be zero: something is divided by it, as by a mass or
+    a time constant, or its root is taken.
 
-    Its size is searched by the logarithm: beside missing physics it would otherwise run to zero.
+    Its size is searched by the logarithm; beside missing physics it would otherwise run to zero. An angle in a sine is
+    no such parameter, and may change its sign.
     """
     if values[i] <= 0.0:
         return False
@@ -318,13 +320,15 @@ def _bends(equations: Equations, x: Array, u: Array, values: Array, i: int) -> b
         rates = rates_at(equations, some, beside, v)
         return np.concatenate([rates, equations.readings(some, beside, np.zeros(at.size), v)], axis=1)
 
-    one, half, double = changed(1.0), changed(0.5), changed(2.0)
-    bend, size = double - 3.0 * one + 2.0 * half, np.abs(double) + np.abs(one) + np.abs(half)
-    return bool(np.any(np.abs(bend) > 1e-9 * np.max(size, axis=0)))
+    with np.errstate(all="ignore"):
+        one, double, tiny, other = changed(1.0), changed(2.0), changed(1e-6), changed(-1.0)
+        grows = np.abs(tiny - one) > 1e3 * np.abs(double - one)
+    changes = double != one
+    return bool(np.any((grows | ~np.isfinite(tiny) | ~np.isfinite(other)) & changes & np.isfinite(one)))
 
 
-def _range(value: float, bends: bool) -> tuple[float, float]:
-    return (value / WIDEST, value * WIDEST) if bends else (-np.inf, np.inf)
+def _range(value: float, log: bool) -> tuple[float, float]:
+    return (value / WIDEST, value * WIDEST) if log else (-np.inf, np.inf)
 
 
 def _flat(into: Mapping[int, Sequence[int]]) -> tuple[float, ...]:
