@@ -439,25 +439,7 @@ _STRIBECK_BRISTLES = Effect(
     plain="coulomb_friction",
 )
 
-_TUSTIN = Effect(
-    name="stribeck_friction",
-    summary="friction that falls as motion starts, at first quickly and then slowly",
-    kind="feedback",
-    stages=("mechanics",),
-    parts=_tustin_parts,
-    equation=r"m\ddot x = F - \left(F_c + F_s e^{-|\dot x|/v_s}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
-    source="A. Tustin, J. IEE 94 IIA (1947) 143; " + _FRICTION_SOURCE,
-    excitation="slow motion and reversals, beside fast motion",
-    prepare=_no_settings,
-    guess=_stribeck_guess,
-    basis=_tustin_basis,
-    fill=_tustin_fill,
-    report=_stribeck_report,
-    vanishes_with=(("static_friction",),),
-    plain="coulomb_friction",
-)
-
-STRIBECK_FRICTION = Effect(
+_SQUARED = Effect(
     name="stribeck_friction",
     summary="friction that falls as motion starts",
     kind="feedback",
@@ -466,13 +448,23 @@ STRIBECK_FRICTION = Effect(
     equation=r"m\ddot x = F - \left(F_c + F_s e^{-(\dot x/v_s)^2}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
     source=_FRICTION_SOURCE,
     excitation="slow motion and reversals, beside fast motion",
-    confusable_with=("coulomb_friction",),
     prepare=_no_settings,
     guess=_stribeck_guess,
     basis=_stribeck_basis,
     fill=_stribeck_fill,
     report=_stribeck_report,
-    variants=(_TUSTIN, _STRIBECK_BRISTLES),
     vanishes_with=(("static_friction",),),
     plain="coulomb_friction",
 )
+
+_TUSTIN = replace(
+    _SQUARED,
+    summary="friction that falls as motion starts, at first quickly and then slowly",
+    parts=_tustin_parts,
+    equation=r"m\ddot x = F - \left(F_c + F_s e^{-|\dot x|/v_s}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
+    source="A. Tustin, J. IEE 94 IIA (1947) 143; " + _FRICTION_SOURCE,
+    basis=_tustin_basis,
+    fill=_tustin_fill,
+)
+
+STRIBECK_FRICTION = replace(_SQUARED, confusable_with=("coulomb_friction",), variants=(_TUSTIN, _STRIBECK_BRISTLES))

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.guest.fmu_linear import linear_equations
+from tools.guest.fmu_linear import linear_equations, unsettled
 
 Array = NDArray[np.float64]
 
@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 RK_ERROR = 1e-6
 """Largest change of an output, as a share of its range, by which half the step may differ."""
 MOST_RK_STEPS = 64
-MOST_UPDATES = 100
-"""Largest number of updates of discrete states at the start."""
 
 
 class FmuError(ValueError):
@@ -195,12 +193,8 @@ class OpenFmu:
         fmu.enterInitializationMode()
         fmu.setReal(to, u[0].tolist())
         fmu.exitInitializationMode()
-        for _ in range(MOST_UPDATES):
-            more, _, _, _, timed, _ = fmu.newDiscreteStates()
-            if timed:
-                raise FmuError("it has events in time, which are not met: export for co-simulation")
-            if not more:
-                break
+        if reason := unsettled(fmu):
+            raise FmuError(f"{reason}: export for co-simulation")
         fmu.enterContinuousTimeMode()
         n_x = int(self.description.numberOfContinuousStates)
         at, rates = (ctypes.c_double * n_x)(), (ctypes.c_double * n_x)()

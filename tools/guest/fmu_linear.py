@@ -19,6 +19,24 @@ LINEAR = 1e-9
 """Largest deviation from a linear map, as a share of the terms that were added, that still counts as rounding."""
 
 
+MOST_UPDATES = 100
+"""Largest number of updates of discrete states at the start."""
+
+
+def unsettled(fmu: Any) -> str:
+    """Update the discrete states at the start; return why the FMU cannot be integrated without events ("" if it can).
+
+    FMI 2.0.4, section 3.2.2: they are updated until no more updates are needed.
+    """
+    for _ in range(MOST_UPDATES):
+        more, _, _, _, timed, _ = fmu.newDiscreteStates()
+        if timed:
+            return "it has events in time, which are not met"
+        if not more:
+            return ""
+    return f"its discrete states change still after {MOST_UPDATES} updates at the start"
+
+
 def linear_equations(
     fmu: Any, description: Any, inputs: list[str], outputs: list[str], start: Mapping[str, Any]
 ) -> dict[str, Any] | None:
@@ -38,12 +56,8 @@ def linear_equations(
     fmu.setReal([known[k].valueReference for k in start], [float(v) for v in start.values()])
     fmu.enterInitializationMode()
     fmu.exitInitializationMode()
-    for _ in range(100):
-        more, _, _, _, defined, _ = fmu.newDiscreteStates()
-        if defined:
-            return None  # an event in time
-        if not more:
-            break
+    if unsettled(fmu):
+        return None
     fmu.enterContinuousTimeMode()
     x, dx = (ctypes.c_double * n_x)(), (ctypes.c_double * n_x)()
     to, of = [known[s].valueReference for s in inputs], [known[o].valueReference for o in outputs]

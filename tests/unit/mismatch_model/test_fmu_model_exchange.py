@@ -124,6 +124,14 @@ def test_events_in_time_are_refused(folder: Path, tmp_path: Path) -> None:
         free_run(load(path))
 
 
+def test_discrete_states_that_never_settle_are_refused(folder: Path, tmp_path: Path) -> None:
+    path = rebuilt(
+        folder, tmp_path, "memset(e, 0, sizeof *e); return 0;", "memset(e, 0, sizeof *e); e->discrete = 1; return 0;"
+    )
+    with pytest.raises(RecordingError, match=r"motor_me.fmu: .*discrete states change still after 100 updates"):
+        free_run(load(path))
+
+
 def test_a_linear_map_is_told_from_others() -> None:
     m = np.array([[0.0, 1.0, 0.0], [-3.0, -0.2, 1e6]])
 
