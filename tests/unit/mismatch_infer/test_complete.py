@@ -11,15 +11,20 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import among, recording, wave
 from tests.unit.mismatch_engine.test_hold_and_one_way import axis
 from tools.mismatch.engine import pose as preparation
+from tools.mismatch.engine.evidence import Doubt
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.pose import Ended, Posed
 from tools.mismatch.engine.report import Hold, Report
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort
 from tools.mismatch.infer import borne_out as infer_borne_out
 from tools.mismatch.infer import diagnose
+from tools.mismatch.infer import run as infer_run
 from tools.mismatch.infer.borne_out import borne_out
 from tools.mismatch.infer.constants import START
+from tools.mismatch.infer.decide import decide
 from tools.mismatch.infer.density import gain_of_events
-from tools.mismatch.infer.run import infer
+from tools.mismatch.infer.run import infer, report_of
 from tools.mismatch.infer.store import outputs_at_odds
 from tools.mismatch.recording import Recording
 
@@ -60,6 +65,24 @@ def test_an_effect_that_the_data_show_is_not_withheld() -> None:
     best = store.ranked()[0]
     assert best.names == {"saturation"}
     assert borne_out(store, among(best, store.base)) == ([best, store.base], ())
+
+
+def test_an_effect_that_the_whole_run_does_not_bear_out_is_withheld(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The decision is made on short stretches where a twin accumulates; the report is about the whole run."""
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    inferred = infer(stack(0.12 * (np.clip(u, -22.0, 25.0) - u), u), START, jobs=1, effects=[EFFECTS["saturation"]])
+    answer = decide(inferred.found.store, inferred.found.first)
+    assert [p.name for p in report_of(inferred, answer, 0.3, 1).physics] == ["saturation"]
+
+    def through(posed: Posed, base: Fit, fitted: Fit, held_out: float) -> Ended:
+        return Ended(base, replace(fitted))
+
+    doubts = [[Doubt(0, "holds_zero", ("limit_high",))], []]
+    monkeypatch.setattr(infer_run, "run_through", through)
+    monkeypatch.setattr(infer_run, "doubts_of", lambda *_: doubts.pop(0))
+    report = report_of(inferred, answer, 0.3, 1)
+    assert (report.verdict, report.physics) == ("unexplained", ())
+    assert [(w.name, w.reason) for w in report.withheld] == [("saturation", "holds_zero")]
 
 
 def test_outputs_that_are_down_to_the_noise_do_not_thin_the_evidence_of_another() -> None:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tools.mismatch.engine.evidence import Doubt, doubt_of
-from tools.mismatch.engine.fit import as_given
+from tools.mismatch.engine.fit import Fit, as_given
 from tools.mismatch.engine.found import human_values, parameters_of
 from tools.mismatch.engine.intervals import Uncertainty, uncertainty
+from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import ParameterValue, Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trust import broken
@@ -70,10 +71,18 @@ def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty)
     return Doubt(k, "below_tolerance", ()) if small else None
 
 
-def entry_of(store: Store, s: Scored, k: int) -> Withheld:
-    """Return the entry of effect ``k`` of a set that is not likely enough to be named."""
+def doubts_of(problem: Problem, fitted: Fit) -> list[Doubt]:
+    """Return why effects of a fit are not named: the figures that an essential size of theirs may be zero by."""
+    unsure = uncertainty(problem, fitted)
+    values = human_values(problem, fitted, unsure)
+    found = (doubt_of(fitted, k, values.get(e.label, {}), unsure) for k, e in enumerate(fitted.model.placed))
+    return [d for d in found if d is not None]
+
+
+def entry_of(store: Store, s: Scored, doubt: Doubt) -> Withheld:
+    """Return the entry of an effect of a set that is in ``doubt``."""
     values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
-    return _entry(store, s, Doubt(k, "unlikely", ()), values, frozenset())
+    return _entry(store, s, doubt, values, frozenset())
 
 
 def _entry(store: Store, s: Scored, doubt: Doubt, values: Values, named: frozenset[str]) -> Withheld:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.problem import Problem
@@ -304,7 +305,11 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     unlikely |= {name for name, p in events.items() if not is_likely(1.0 - p, judged.known, c)}
     if unlikely:
         final = judged.final
-        withheld += tuple(entry_of(store, final, k) for k, e in enumerate(final.placed) if e.effect.name in unlikely)
+        withheld += tuple(
+            entry_of(store, final, Doubt(k, "unlikely", ()))
+            for k, e in enumerate(final.placed)
+            if e.effect.name in unlikely
+        )
         chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
         fewer = judge(store, chosen, strange, events.keys() - unlikely)
         # fewer names are no better account
@@ -319,6 +324,23 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     return Answer(
         judged.final, sure, rivals_of(store, chosen), strange, left, judged.rest.floors, judged.whole, judged.doubtful,
         withheld,
+    )  # fmt: skip
+
+
+def without_doubted(store: Store, answer: Answer, through: Fit, doubts: Sequence[Doubt]) -> Answer:
+    """Return ``answer`` without the effects that are in doubt in ``through``, its fit over the whole run.
+
+    Fewer names are no better account.
+    """
+    of = replace(answer.chosen, fitted=through)
+    names = {of.placed[d.k].effect.name for d in doubts}
+    smaller = store.without(answer.chosen, lambda e: e.effect.name in names)
+    judged = judge(store, smaller, answer.strange, frozenset())
+    return replace(
+        answer, chosen=judged.final, sure={n: p for n, p in answer.sure.items() if n not in names},
+        rivals=rivals_of(store, judged.final), left=_with_leads(store.problem, judged.rest), floors=judged.rest.floors,
+        whole=answer.whole and judged.whole, doubtful=judged.doubtful,
+        withheld=(*answer.withheld, *(entry_of(store, of, d) for d in doubts)),
     )  # fmt: skip
 
 

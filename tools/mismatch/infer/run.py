@@ -16,12 +16,13 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import conclude
 from tools.mismatch.engine.hold import with_hold
 from tools.mismatch.engine.identifiability import LeastNamed, experiment
-from tools.mismatch.engine.pose import Posed, pose, run_through
+from tools.mismatch.engine.pose import Ended, Posed, pose, run_through
 from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
+from tools.mismatch.infer.borne_out import doubts_of
 from tools.mismatch.infer.constants import Constants, learned
-from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated
+from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated, without_doubted
 from tools.mismatch.infer.holds import better_holds
 from tools.mismatch.infer.pooled import pool
 from tools.mismatch.infer.sealed import score_sealed, seal
@@ -86,10 +87,7 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
     """Return the report of an answer."""
     store = inferred.found.store
     posed = replace(inferred.posed, problem=store.problem)  # with the noise floors that the search found
-    decision = verdict_of(posed, store, answer)
-    named = decision.verdict in ("missing_physics", "unexplained")
-    chosen = answer.chosen if named else store.base
-    ended = run_through(posed, store.base.fitted, chosen.fitted, held_out)
+    answer, decision, chosen, ended = _through(posed, store, answer, held_out)
     report = conclude(
         posed, ended, inferred.found.first, dict(answer.left), decision=decision, sure=answer.sure,
         least=least_named(store), withheld=answer.withheld, jobs=jobs,
@@ -105,6 +103,23 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
         alternatives=alternatives_of(store, answer) if chosen.placed else (),
         equivalent=equivalents_of(store, answer) if chosen.placed else (),
     )
+
+
+def _through(posed: Posed, store: Store, answer: Answer, held_out: float) -> tuple[Answer, Decision, Scored, Ended]:
+    """Return the answer with its verdict, the reported set, and the fits that run through the whole record.
+
+    The decision is made on short stretches where the twin accumulates. An effect that the run through the whole record
+    does not bear out is dropped.
+    """
+    while True:
+        decision = verdict_of(posed, store, answer)
+        named = decision.verdict in ("missing_physics", "unexplained")
+        chosen = answer.chosen if named else store.base
+        ended = run_through(posed, store.base.fitted, chosen.fitted, held_out)
+        doubts = doubts_of(posed.problem, ended.fitted) if ended.fitted is not chosen.fitted else []
+        if not doubts:
+            return answer, decision, chosen, ended
+        answer = without_doubted(store, answer, ended.fitted, doubts)
 
 
 def least_named(store: Store) -> LeastNamed:
