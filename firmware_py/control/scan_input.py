@@ -103,7 +103,8 @@ class ScanInput:
         """Report what the arrival of ``ticks`` reveals about the link and this host."""
         limits, name, holds = self._limits, self._daq.name, self._incidents.holds
         if ticks.n > 1:
-            self._incidents.notice("scans came late")
+            if not self._run.scheduler.is_announced:  # an arming that ramps takes its time
+                self._incidents.notice("scans came late")
             if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
                 self._incidents.report(Finding.HOST_LATE, scans=ticks.n, device=name)
             elif self._run.supervisor.is_holding and ticks.n * ticks.dt_ns > limits.stale_ms * 1e6:

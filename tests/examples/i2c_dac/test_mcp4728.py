@@ -76,5 +76,6 @@ def test_it_runs_as_the_output_of_the_default_bench(tmp_path: Path):
     assert outcome["devices"]["piezo"] == "MCP4728 at 0x60, 0 .. 100 V"
     assert outcome["commands"]["sent"] >= 999
     assert outcome["commands"]["clipped"] == 0
+    assert outcome["noticed"] == {}
     moved_m = np.ptp(np.asarray(truth["tip_m"]) - np.asarray(truth["tip_rigid_m"]), axis=0)
     assert np.all(moved_m > 1e-6)
