@@ -370,33 +370,45 @@ def apply(
 
 def simulate(
     twin: Annotated[
-        Path, typer.Argument(metavar="TWIN", help="Corrected twin that 'apply' wrote: .toml, .py or .fmu.")
+        Path,
+        typer.Argument(
+            metavar="TWIN|RECORDING",
+            help="Corrected twin that 'apply' wrote: .toml, .py or .fmu; or the recording, whose own twin is then run.",
+        ),
     ],
-    recording: RecordingArgument,
+    recording: Annotated[
+        Path | None, typer.Argument(metavar="[RECORDING]", help="A recording (folder or .toml) for the corrected twin.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
     json_file: JsonOption = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
 ) -> None:
-    """Run a corrected twin freely over a whole recording and print how far it is from what was recorded.
+    """Run a twin freely over a whole recording and print how far it is from what was recorded.
 
     Example: micron mismatch simulate twin.py rec --out simulated.csv
+
+    The recording's own twin, and what was read of the recording: micron mismatch simulate rec
     """
     with clear_errors():
         check_writable(out, json_file)
-        decide_on([twin, recording], trust, allow_outside)
-        from tools.mismatch.export.run import Residual, residuals, simulate_file
+        decide_on([twin, recording or twin], trust, allow_outside)
+        from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import load
+        from tools.mismatch.report.wording import percent
 
-        loaded = load(recording)
-        simulated = simulate_file(twin, recording)
+        loaded = load(recording or twin)
+        for line in as_read(loaded):
+            console().print(line, highlight=False)
+        simulated = simulate_own(loaded) if recording is None else simulate_file(twin, recording)
         rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
             write_text_atomic(out, columns(loaded, simulated))
         say = console() if json_file == "-" else data_console()
         for row in rows:
-            say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}", highlight=False)
+            share = "" if row.share is None else f", {percent(row.share)} of the recording's standard deviation"
+            say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}{share}", highlight=False)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
 
 

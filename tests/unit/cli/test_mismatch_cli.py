@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -14,6 +15,8 @@ from tests.unit.mismatch_report.canned import all_verdicts, missing_physics
 from tests.unit.mismatch_report.contract_check import NAMES, faults
 from tests.unit.mismatch_report.systems import TWIN, recording
 from tools.cli.main import app
+from tools.mismatch.export.run import free_run
+from tools.mismatch.recording_load import load
 from tools.research.prove.proof import ProofResult
 
 runner = CliRunner()
@@ -283,3 +286,22 @@ def test_a_calibration_that_is_not_finished_says_how_to_go_on(tmp_path: Path):
     result = run("calibrate", "--keep", tmp_path / "kept", "--cases", 8, "--samples", 1000, "--minutes", 0)
     assert result.exit_code == 0, result.stderr
     assert "8 of 8 cases are still to be done; run the same command again" in " ".join(result.stderr.split())
+
+
+def test_simulate_of_a_recording_runs_its_own_twin_and_says_what_was_read(stack: Path):
+    result = run("simulate", stack, "--json", "-")
+    assert result.exit_code == 0
+    (row,) = json.loads(result.stdout)["outputs"]
+    loaded = load(stack)
+    (o,) = loaded.outputs
+    away = loaded.outputs[o] - free_run(loaded)[o]
+    assert row["rms"] == pytest.approx(float(np.sqrt(np.mean(away**2))))
+    assert row["share"] == pytest.approx(row["rms"] / float(np.std(loaded.outputs[o])))
+    assert f"samples: 300 at {1 / loaded.dt:g} Hz" in result.stderr
+    assert "inputs: command (V, hold" in result.stderr
+
+
+def test_simulate_of_no_recording_is_bad_input(tmp_path: Path):
+    result = run("simulate", tmp_path / "nothing")
+    assert result.exit_code == 2
+    assert "no such recording" in result.stderr

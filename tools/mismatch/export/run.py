@@ -1,4 +1,4 @@
-"""Loads and runs a corrected twin from any kind of file: ``simulate_file(twin, recording)``."""
+"""Loads and runs a twin: that of a recording (``simulate_own``), or one of any kind of file (``simulate_file``)."""
 
 from __future__ import annotations
 
@@ -19,19 +19,26 @@ from tools.mismatch.recording_load import load, load_twin
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.fmu import FmuRun, with_equations
+from tools.mismatch.twins.holds import declared_holds
 from tools.mismatch.twins.make import make
+from tools.numbers import rms
 
 KINDS = (".toml", ".py", ".fmu")
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Holds the rms of recorded minus simulated of an output, in the unit of the file; ``where`` names the samples."""
+    """Holds the rms of recorded minus simulated of an output, in the unit of the file.
+
+    ``where`` names the samples; ``share`` is the rms over that of the recorded output less its mean (None if it is
+    constant).
+    """
 
     output: str
     unit: str
     rms: float
     where: str
+    share: float | None
 
     def as_dict(self) -> dict[str, object]:
         """Return the row of the command's JSON."""
@@ -46,12 +53,34 @@ def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual
     if isinstance(test, tuple):
         parts[f" on samples {test[0]} to {test[1]}"] = test
     for o, y in found.items():
-        away = units.convert(recording.outputs[o], recording.unit[o], recording.file_unit[o]) - y
-        rows += [
-            Residual(o, recording.file_unit[o], float(np.sqrt(np.mean(away[a:b] ** 2))), where)
-            for where, (a, b) in parts.items()
-        ]
+        recorded = units.convert(recording.outputs[o], recording.unit[o], recording.file_unit[o])
+        for where, (a, b) in parts.items():
+            left, moved = rms((recorded - y)[a:b]), float(np.std(recorded[a:b]))
+            rows.append(Residual(o, recording.file_unit[o], left, where, left / moved if moved > 0.0 else None))
     return rows
+
+
+def as_read(recording: Recording) -> list[str]:
+    """Return what was read of a recording, as lines: twin, clock, signals, holds of inputs, notes."""
+    holds = declared_holds(recording)
+    named = lambda of: ", ".join(f"{s} ({recording.file_unit[s]})" for s in of)  # noqa: E731
+    held = ", ".join(f"{s} ({recording.file_unit[s]}, hold {holds.get(s, 'not given')})" for s in recording.inputs)
+    runs = f" in {len(recording.segments) + 1} runs" if recording.segments else ""
+    lines = [
+        f"twin: {recording.twin.kind}",
+        f"samples: {recording.n}{runs} at {1 / recording.dt:g} Hz, {recording.n * recording.dt:g} s",
+        f"inputs: {held}",
+        f"outputs: {named(recording.outputs)}",
+    ]
+    if recording.context:
+        lines.append(f"other signals: {named(recording.context)}")
+    return [*lines, *(f"note: {note}" for note in recording.warnings)]
+
+
+def simulate_own(recording: Recording) -> dict[str, Array]:
+    """Return the outputs (n,) of the twin that a recording names, in a free run and in the units of its file."""
+    found = free_run(with_equations(recording))
+    return {o: units.convert(y, recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
 
 
 def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
@@ -72,8 +101,7 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
                 raise RecordingError(
                     f"{path} is a {other.twin.kind} and {rec.path} describes a {rec.twin.kind}; give one of that kind"
                 )
-            found = free_run(other)
-            return {o: units.convert(y, rec.unit[o], rec.file_unit[o]) for o, y in found.items()}
+            return simulate_own(other)
         case ".py":
             return _of(path, rec, _run_module(path, rec))
         case ".fmu":
