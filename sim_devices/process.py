@@ -4,7 +4,9 @@ The job file (written by ``sim_devices.process_world``) holds the bench descript
 process serves each serial bus on a pty (and, on request, a TCP port), each I2C bus and each CAN bus on a Unix socket
 (a CAN bus with ``sim://NAME?via=slcan`` as a serial adapter on a pty, and for programs of others on UDP multicast or an
 interface of the kernel) and writes their URIs to ``endpoints.json`` when it is ready. It obeys orders on
-``control.sock`` (``sim_devices.control``); on SIGTERM or when its parent is gone it writes ``truth.npz`` and ends.
+``control.sock`` (``sim_devices.control``); on ``END`` or when its parent is gone it writes ``truth.npz`` and ends.
+SIGINT and SIGTERM are not for it: who sends them to all processes of a run ends the firmware, which needs its devices
+until the outputs are at neutral.
 
 One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
 millisecond. For a firmware in real time device clocks never stretch: after a stall every scan that was due is made up,
@@ -36,6 +38,7 @@ from sim_devices.control import WorldControl
 from sim_devices.faces import ByteFace
 from sim_devices.faults import inject
 from sim_devices.lateness import Lateness
+from sim_devices.linger import END, Linger
 from sim_devices.transports.can_carrier import CanCarrier, free_udp_port, on_multicast, on_socketcan
 from sim_devices.transports.can_socket import CanSocketServer
 from sim_devices.transports.control_socket import ControlSocket
@@ -48,11 +51,6 @@ from sim_devices.world import Plant, World
 POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
-LINGER_NS = 1_000_000_000
-"""Time for which the world continues after the death of the firmware. It also continues while a guardian is
-connected."""
-LONGEST_LINGER_NS = 60_000_000_000
-"""A client that does not go away keeps the world for so long at most."""
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
 SOON_NS = 100_000
 """Longest time that taking a request or ending a transfer keeps the process from what is due next."""
@@ -155,7 +153,7 @@ class WorldProcess:
         control = WorldControl(self.world, self._strike, lambda: self._now_ns, self._clock)
         self._control = ControlSocket(sockets / "control.sock", control.answer)
         self._stop = False
-        self._orphaned_ns: int | None = None
+        self._linger = Linger()
         self._worst_late_ns = 0
         self._lateness = Lateness(self._runtime_dir)
         self._turns = 0
@@ -169,16 +167,7 @@ class WorldProcess:
 
     def outlive_parent(self, *_: object) -> None:
         """The firmware is gone; a device does not end with it, and a guardian may still want it."""
-        if self._orphaned_ns is None:
-            self._orphaned_ns = self._clock.now_ns()
-
-    def _is_wanted(self) -> bool:
-        """There is a firmware, or one has just died, or its guardian is still at work."""
-        if self._orphaned_ns is None:
-            return True
-        alone_ns = self._now_ns - self._orphaned_ns
-        guarded = any(server.has_clients for server in self._i2c.values())
-        return alone_ns < (LONGEST_LINGER_NS if guarded else LINGER_NS)
+        self._linger.begin(self._clock.now_ns())
 
     def tcp_ports(self) -> dict[str, int]:
         """TCP port of each serial bus that has one."""
@@ -208,7 +197,7 @@ class WorldProcess:
                 check_ns = self._now_ns + PARENT_CHECK_NS
                 if os.getppid() != self._parent:
                     self.outlive_parent()
-                if not self._is_wanted():
+                if self._linger.is_over(self._now_ns, any(server.has_clients for server in self._i2c.values())):
                     break
         self._finish()
 
@@ -371,13 +360,14 @@ def main(argv: list[str]) -> int:
     job_path = Path(argv[0])
     job = json.loads(job_path.read_text(encoding="utf-8"))
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGHUP)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the firmware; it ends us when it is done
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # they are for the firmware; it ends us when it is done
     try:
         process = WorldProcess(job)
     except HalError as error:
         job_path.with_name("error.txt").write_text(str(error), encoding="utf-8")
         return 2
-    signal.signal(signal.SIGTERM, process.request_stop)
+    signal.signal(END, process.request_stop)
     signal.signal(signal.SIGHUP, process.outlive_parent)
     gc.collect()
     gc.freeze()

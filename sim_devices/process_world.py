@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import tempfile
@@ -19,6 +18,7 @@ import numpy as np
 from hal.children import child_command, child_environment
 from hal.errors import BenchError, DeviceNotFound, Disconnected, HalTimeout
 from sim_devices.lateness import LatenessView
+from sim_devices.linger import END
 
 if TYPE_CHECKING:  # the physics and its kernels are the other process's
     from sim_devices.world import Truth
@@ -61,6 +61,7 @@ class ProcessWorld:
                 stdout=log,
                 stderr=log,
                 env=child_environment(),
+                start_new_session=True,  # signals to the firmware's group are not for its devices
             )
         ready = self._await_endpoints()
         self._endpoints: dict[str, str] = ready["endpoints"]
@@ -82,7 +83,7 @@ class ProcessWorld:
     def stop(self) -> None:
         """End the process; when this returns the truth is on disk. Idempotent."""
         if self.alive():
-            self._process.send_signal(signal.SIGTERM)
+            self._process.send_signal(END)
         try:
             self._process.wait(STOP_S)
         except subprocess.TimeoutExpired:

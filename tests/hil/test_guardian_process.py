@@ -72,6 +72,7 @@ class Run:
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
+            start_new_session=True,
         )
 
     def end(self) -> None:
@@ -293,6 +294,19 @@ def test_a_bus_that_hangs_for_more_than_half_a_second_is_opened_anew_and_brought
     assert outcome["holds"] or not safe["normal"]
     with np.load(run.folder / "truth.npz", allow_pickle=False) as truth:
         np.testing.assert_allclose(truth["amplifier_V"][-1], NEUTRAL_V, atol=0.01)
+
+
+@pytest.mark.parametrize("is_compiled", LOOPS)
+def test_a_signal_to_all_processes_of_a_run_ends_it_at_neutral(run: Run) -> None:
+    """The emulated world once ended by it as well, before the outputs were at neutral."""
+    run.wait_until_moving(0.0)
+    os.kill(run.world(), signal.SIGTERM)
+    os.killpg(run.process.pid, signal.SIGTERM)
+    safe = run.outcome()["safe_state"]
+    assert safe["reached"], safe["reason"]
+    assert safe["finding"] == "stopped"
+    _, volts = run.amplifier()
+    np.testing.assert_allclose(volts[-1], NEUTRAL_V, atol=0.01)
 
 
 @pytest.mark.slow  # 16 s: it waits until nobody can answer any more

@@ -146,6 +146,21 @@ def test_unplug_stop_and_truth(tmp_path: Path) -> None:
     assert "worst_late_us" in world.statistics()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_a_whole_run_leaves_the_devices_to_the_firmware(tmp_path: Path, number: signal.Signals) -> None:
+    """``timeout`` and systemd send SIGTERM to every process of a run, and a device answers until the run is over."""
+    world = start(tmp_path)
+    assert os.getsid(world.pid) == world.pid
+    bus = open_i2c(world.endpoint("i2c1"))
+    os.kill(world.pid, number)
+    for _ in range(3):  # the second one is read in a turn that began after the signal
+        assert bus.transfer(0x48, [I2cWrite(b"\x01"), I2cRead(2)]) == b"\x85\x83"
+    bus.close()
+    world.stop()
+    assert not world.alive()
+    assert len(world.truth()["t_ns"]) > 0
+
+
 def test_killed_world_hangs_up_and_says_that_truth_is_lost(tmp_path: Path) -> None:
     world = start(tmp_path)
     port = open_serial(world.endpoint("daq0"))
