@@ -13,6 +13,7 @@ from sim_devices.physics.forces import base_moves
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
+from tools.mismatch.simulate_balance import balanced
 from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, travelled
@@ -72,12 +73,14 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
         out.append(th)
     if flows:
         return out
-    out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x=x, residual=residual, ctx=ctx), *out]
+    weighed = balanced(model, k, view, theta, x, ctx) if pl.site == "feedback" else []
+    back = bent_back(model, k, theta, [th[a] for th in out][:2], x=x, residual=residual, ctx=ctx)
+    out = [*weighed, *back, *out]
     if not twin.static:
         # the re-fitted base may compensate the effect, so the engineer's own base is a start as well
         given = twin.start(view.recording)
         if not np.allclose(given, theta[: model.n_base], rtol=1e-3, atol=0.0):
-            out += _from_believed(model, rest, k, view, out[:2], given)
+            out += _from_believed(model, rest, k, view, out[len(weighed) :][:2], given)
     return out
 
 

@@ -69,6 +69,9 @@ def axis_twin(recording: Recording) -> DynamicTwin:
             out["hold"] = holds_text(holds)
         return out
 
+    def motion_of(x: Array, v: Array, u: Array) -> Array:
+        return np.column_stack([-v, *([-x] if sprung else []), u, np.ones(u.size)])
+
     rates = np.roots([1.0, damping / mass, stiffness / mass])
     span = recording.n * recording.dt
     return DynamicTwin(
@@ -89,6 +92,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
         restart=bool(np.min(-rates.real) * span < 20.0),
         feedback_on="position" if "position" in outputs else "velocity",
         counted="" if "position" in outputs else "rest" if sprung else "start",
+        motion_of=motion_of,
         fastest_per_s=float(np.max(np.abs(rates))) if sprung else float(damping / mass),
     )
 

@@ -241,6 +241,33 @@ class Twin(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Balance:
+    """Holds both sides of an equation of motion along a recording.
+
+    ``rate`` (n,) is the derivative of the ``order`` (1 or 2) of the ``reading`` (n,), by central differences; ``model``
+    (n,) is the same by the equations without forces, and ``slopes`` (n, k) are its derivatives with respect to the base
+    parameters.
+    """
+
+    reading: Array
+    order: int
+    rate: Array
+    model: Array
+    slopes: Array
+
+
+def central_difference(x: Array, dt: float, order: int) -> Array:
+    """Return the derivative (n,) of ``order`` 1 or 2 by central differences; the ends repeat their neighbours."""
+    inner = (x[2:] - x[:-2]) / (2 * dt) if order == 1 else (x[2:] - 2 * x[1:-1] + x[:-2]) / dt**2
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def midway(u: Array, held: bool) -> Array:
+    """Return an input (n,) as a central difference sees it: held, it is the mean of both sides of a sample."""
+    return np.concatenate([u[:1], 0.5 * (u[1:] + u[:-1])]) if held else u
+
+
 def travelled(velocity: Array, dt: float, counted: Counted) -> Array:
     """Integrate a recorded velocity to a position (n,); its mean is zero where a spring holds it."""
     x = np.concatenate([[0.0], np.cumsum(0.5 * dt * (velocity[1:] + velocity[:-1]))])

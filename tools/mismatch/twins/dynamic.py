@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import UNCENTRED
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, travelled
+from tools.mismatch.twins.base import Balance, Counted, Force, Run, Signal, central_difference, midway, travelled
 from tools.mismatch.twins.feedback import Body, Rows, pack
 from tools.mismatch.twins.forced import ForcedRun
 from tools.mismatch.twins.head import Head
@@ -87,6 +87,9 @@ class DynamicTwin(Head):
     start_given: bool = False
     at_rest: bool = False
     """True if the given start state is zero."""
+    motion_of: Callable[[Array, Array, Array], Array] | None = None
+    """(position, velocity, input), each (n,) -> the slopes (n, k) of the acceleration, which is linear in the base
+    parameters; None if it is not."""
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -116,6 +119,22 @@ class DynamicTwin(Head):
     def to_text(self, theta: Array) -> dict[str, object]:
         """See Twin."""
         return self.text_of(theta)
+
+    def balance(self, run: Run, theta: Array, target: str) -> Balance | None:
+        """Return both sides of the equation of motion along the recording; None where a state was not recorded."""
+        if self.motion_of is None:
+            return None
+        v = run.measured.get("velocity")
+        x = run.measured["position"] if v is None else run.measured.get("position")
+        order = 2 if v is None else 1
+        reading = x if v is None else v
+        assert reading is not None
+        v = central_difference(reading, run.dt, 1) if v is None else v
+        x = travelled(v, run.dt, self.counted or "start") if x is None else x
+        drive = self.inputs[0]
+        slopes = self.motion_of(x, v, midway(run.signals[drive], self.holds[drive] == "zero"))
+        rate = central_difference(reading, run.dt, order)
+        return Balance(reading, order, rate, slopes @ theta[: slopes.shape[1]], slopes)
 
     def _gain_index(self, signal: str) -> int:
         js = {link.j for link in self.links if link.source == signal}

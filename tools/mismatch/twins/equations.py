@@ -107,6 +107,10 @@ class Equations(Protocol):
         """Return the derivatives (s,) at time zero, without forces."""
         ...
 
+    def rates_along(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """Return the derivatives (n, s) at states (n, s), signals (n, m) and times (n,), without forces."""
+        ...
+
 
 @dataclass(frozen=True)
 class Programs:
@@ -138,6 +142,10 @@ class Programs:
     def rates(self, x: Array, u: Array, values: Array) -> Array:
         """See Equations."""
         return rates_of(self._set(self.rates_program, values), x, u)
+
+    def rates_along(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """See Equations."""
+        return run_readings(self._set(self.rates_program, values), x, u, t)
 
     def _set(self, program: Program, values: Array) -> Program:
         registers = program.registers.copy()
@@ -185,7 +193,7 @@ def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: 
 
 def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
     """Return the derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
-    return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
+    return equations.rates_along(np.ascontiguousarray(x), np.ascontiguousarray(u), np.zeros(x.shape[0]), values)
 
 
 Edges = list[tuple[int, int]]

@@ -15,7 +15,7 @@ from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.affine import Steps, exact_steps, run_pushed
-from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
+from tools.mismatch.twins.base import Balance, Counted, Force, Run, Signal, central_difference, fold, midway
 from tools.mismatch.twins.equations import (
     LEAST_SHOWN,
     NOTHING,
@@ -210,6 +210,36 @@ class OdeTwin(Head):
                     break
             found.append((np.ascontiguousarray(y), recorded))
         return found
+
+    def balance(self, run: Run, theta: Array, target: str) -> Balance | None:
+        """Return both sides of the equation of motion at a place along the recording.
+
+        None where a state was not recorded, be it as the derivative of a position.
+        """
+        place = self.place(target)
+        if place.kind != "motion":
+            return None
+        found = self._courses(run, theta, range(len(self.state_list)))
+        x = np.column_stack([y for y, _ in found])
+        recorded = [read for _, read in found]
+        order = 1 if recorded[place.velocity] else 2
+        for p in self.places:
+            if p.kind == "motion" and recorded[p.position] and not recorded[p.velocity]:
+                x[:, p.velocity], recorded[p.velocity] = central_difference(x[:, p.position], run.dt, 1), True
+        if not all(recorded) or place.target != place.velocity:
+            return None
+        reading = np.ascontiguousarray(x[:, place.velocity if order == 1 else place.position])
+        u = np.column_stack([midway(run.signals[s], h) for s, h in zip(self.signals, self.held.tolist(), strict=True)])
+
+        def modelled(theta: Array) -> Array:
+            return self.equations.rates_along(x, u, run.t, self.values(theta))[:, place.target]
+
+        model, slopes = modelled(theta), list[Array]()
+        for i in range(len(self.free)):
+            moved = theta.copy()
+            moved[i] += 1e-4 * (abs(theta[i]) or abs(self.parameters[i].scale) or 1.0)
+            slopes.append((modelled(moved) - model) / (moved[i] - theta[i]))
+        return Balance(reading, order, central_difference(reading, run.dt, order), model, np.column_stack(slopes))
 
     # -- simulation -----------------------------------------------------------------------------------
 

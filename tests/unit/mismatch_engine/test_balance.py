@@ -1,0 +1,113 @@
+"""Forces are started from the balance of the equation of motion along a recording, without a run.
+
+The courses are closed forms: a position of three sines has exact derivatives, and the drive is what the equation of
+motion asks for. So the balance must give back every number of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording
+from tools.mismatch.engine.fit import as_given
+from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.screen import places
+from tools.mismatch.recording import Recording, TwinText
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_balance import balanced, bump, noise_of
+from tools.mismatch.simulate_start import prepare, probe_signals
+from tools.mismatch.twins.base import central_difference, midway
+
+RATE_HZ, N = 500.0, 6000
+MASS, DAMPING, PERIOD, COG = 2.0, 8.0, 0.4, 1.5
+T = np.arange(N) / RATE_HZ
+SINES = ((0.9, 1.3), (0.5, 3.1), (0.2, 7.7))  # metres, rad/s
+
+
+def moved(of: int) -> np.ndarray:
+    """Position, velocity or acceleration."""
+    turn = (np.sin, np.cos, lambda a: -np.sin(a))[of]
+    return np.sum([a * w**of * turn(w * T) for a, w in SINES], axis=0)
+
+
+def axis(noise_m: float, believed: dict[str, float], outputs: tuple[str, ...] = ("position",)) -> Recording:
+    x, v, a = (moved(k) for k in range(3))
+    force = MASS * a + DAMPING * v - COG * np.sin(2 * np.pi * x / PERIOD) + 0.3
+    rng = np.random.default_rng(3)
+    noisy = {"position": x, "velocity": v}
+    measured = {o: noisy[o] + noise_m * rng.standard_normal(N) for o in outputs}
+    units = {"hold": "linear", **believed}
+    return recording("mechanical_axis", {"force": force}, measured, units, rate_hz=RATE_HZ)
+
+
+def started(rec: Recording, effect: str) -> tuple[Model, list[np.ndarray]]:
+    problem, _, _ = prepared(rec, 0.3, 0, False)
+    given = as_given(problem)
+    (place,) = [p for p in places(problem, [EFFECTS[effect]], ()) if p.site == "feedback"][:1]
+    placed = prepare(given.model, problem.fit_view, given.theta, place)
+    model = Model(problem.twin, (placed,))
+    theta = model.carry(given.model, given.theta, problem.recording)
+    x, ctx = probe_signals(given.model, problem.fit_view, given.theta, placed, "position")
+    return model, balanced(model, 0, problem.fit_view, theta, x, ctx)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-3])
+def test_the_balance_gives_back_cogging_and_the_base_that_is_a_quarter_off(noise_m: float) -> None:
+    model, starts = started(axis(noise_m, {"mass": 2.5, "damping": 6.0, "offset_force": 0.0}), "cogging")
+    got = dict(zip([p.name.rsplit(".", 1)[-1] for p in model.parameters], starts[0], strict=True))
+    assert got["period"] == pytest.approx(PERIOD, rel=0.01)
+    assert got["damping_per_mass"] == pytest.approx(DAMPING / MASS, rel=0.02)
+    assert got["inverse_mass"] == pytest.approx(1 / MASS, rel=0.02)
+    assert got["offset_per_mass"] == pytest.approx(-0.3 / MASS, abs=0.01)
+    assert np.hypot(got["sin1"], got["cos1"]) == pytest.approx(COG / MASS, rel=0.03)
+
+
+def equations(believed: dict[str, float]) -> dict[str, object]:
+    return {
+        "states": {"position": {"unit": "m"}, "speed": {"unit": "m/s"}},
+        "equations": {"position": "speed", "speed": "(force + load - damping * speed) / mass"},
+        "hold": "linear",
+        **believed,
+    }
+
+
+def test_equations_balance_as_the_axis_does_and_not_where_a_state_was_not_recorded() -> None:
+    believed = {"mass": 2.5, "damping": 6.0, "load": 0.0}
+    rec = axis(1e-3, believed)
+    model, starts = started(replace(rec, twin=TwinText("ode", equations(believed))), "cogging")
+    got = dict(zip([p.name.rsplit(".", 1)[-1] for p in model.parameters], starts[0], strict=True))
+    assert got["period"] == pytest.approx(PERIOD, rel=0.01)
+    # only ratios are in the balance: one step of least squares moves all three
+    assert got["damping"] / got["mass"] == pytest.approx(DAMPING / MASS, rel=0.1)
+    hidden = equations(believed)
+    hidden["states"] = {**hidden["states"], "lagged": {"unit": "N"}}  # type: ignore[dict-item]
+    hidden["equations"] = {
+        "position": "speed",
+        "speed": "(lagged + load - damping * speed) / mass",
+        "lagged": "(force - lagged) / 0.01",
+    }
+    assert started(replace(rec, twin=TwinText("ode", hidden)), "cogging")[1] == []
+
+
+def test_only_noise_gives_no_start() -> None:
+    """Under no bump is the acceleration of such readings calm."""
+    assert started(axis(0.5, {"mass": 2.5, "damping": 6.0}), "cogging")[1] == []
+
+
+def test_a_bump_has_the_sum_one_and_noise_is_read_off_beside_a_smooth_course() -> None:
+    assert np.sum(bump(7)) == pytest.approx(1.0)
+    assert bump(7)[0] < 1e-2 * bump(7)[7]
+    readings = moved(0) + 0.01 * np.random.default_rng(1).standard_normal(N)
+    assert noise_of(readings) == pytest.approx(0.01, rel=0.05)
+
+
+def test_differences_are_those_of_a_parabola_and_a_held_input_lies_half_a_sample_late() -> None:
+    x = 0.5 * 3.0 * T**2
+    assert central_difference(x, 1 / RATE_HZ, 2) == pytest.approx(np.full(N, 3.0), rel=1e-6)
+    assert central_difference(x, 1 / RATE_HZ, 1)[1:-1] == pytest.approx(3.0 * T[1:-1], rel=1e-9)
+    assert midway(np.array([1.0, 3.0, 5.0]), True).tolist() == [1.0, 2.0, 4.0]
+    assert midway(np.array([1.0, 3.0]), False).tolist() == [1.0, 3.0]
