@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -71,7 +71,7 @@ def _axis_settings(x: Array, residual: Array, ctx: Context) -> Settings:
 _PAIRS = (("x", "y"), ("x", "z"), ("y", "z"))
 
 
-def _rotation_columns(ctx: Context) -> Array:
+def _rotation_columns(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     """Return the columns of a small rotation of the whole vector: output i gets -(phi x f)_i."""
     vector = vector_at(ctx)
     i = "xyz".index(own_axis(ctx.output))
@@ -85,10 +85,6 @@ def _rotation_columns(ctx: Context) -> Array:
     return out
 
 
-def _mis_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return _axis_settings(x, residual, ctx)
-
-
 def _mis_parts(settings: Settings) -> Parts:
     return Parts((), tuple(Parameter(f"from_{a}", "{out}/{in}", scale=0.01) for a in _axes(settings)))
 
@@ -100,22 +96,8 @@ def _mis_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return np.stack(_columns_of(ctx, axes), axis=1)
 
 
-def _mis_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    g = scale or 1.0
-    return [Human(f"angle_to_{a}", 1e3 * float(v) / g, "mrad") for a, v in zip(_axes(settings), p, strict=True)]
-
-
-def _rot_parts(settings: Settings) -> Parts:
-    return Parts((), tuple(Parameter(f"rotation_{a}", "{out}/{in}", scale=0.01) for a in "xyz"))
-
-
-def _rot_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return _rotation_columns(ctx)
-
-
-def _rot_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    g = scale or 1.0
-    return [Human(f"rotation_{a}", 1e3 * float(v) / g, "mrad") for a, v in zip("xyz", p, strict=True)]
+def _in_mrad(name: str, axes: Iterable[str], p: Array, scale: float) -> Sequence[Human]:
+    return [Human(name + a, 1e3 * float(v) / (scale or 1.0), "mrad") for a, v in zip(axes, p, strict=True)]
 
 
 _MIS_SOURCE = "IEEE Std 1293-2018, model equation (cross-axis sensitivities); D. Titterton, J. Weston, ch. 8"
@@ -125,12 +107,12 @@ _ROTATION = Effect(
     summary="the whole sensor is turned by a small angle",
     kind="add",
     stages=("mounting",),
-    parts=_rot_parts,
+    parts=lambda settings: Parts((), tuple(Parameter(f"rotation_{a}", "{out}/{in}", scale=0.01) for a in "xyz")),
     equation=r"y = x - s\,(\varphi \times f)_i",
     source=_MIS_SOURCE,
     excitation="every axis moved on its own",
-    basis=_rot_basis,
-    report=_rot_report,
+    basis=_rotation_columns,
+    report=lambda p, settings, scale: _in_mrad("rotation_", "xyz", p, scale),
     driven=False,
     sites=("output",),
     available=_turnable,
@@ -148,9 +130,9 @@ MISALIGNMENT = Effect(
     source=_MIS_SOURCE,
     excitation="every axis moved on its own, or tumbles",
     confusable_with=("soft_iron", "sensor_position_error"),
-    prepare=_mis_prepare,
+    prepare=_axis_settings,
     basis=_mis_basis,
-    report=_mis_report,
+    report=lambda p, settings, scale: _in_mrad("angle_to_", _axes(settings), p, scale),
     driven=False,
     sites=("output",),
     available=_available,

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.hysteresis import stops
-from sim_devices.physics.statistics import least_squares, thin
+from sim_devices.physics.statistics import best_starts, thin
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -32,13 +32,9 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     k = thin(ctx.keep, 8000)
     straight = ctx.line(x, k)
     grid = span * np.geomspace(5e-4, 0.4, 16)
-    every = stops(x, grid, float(x[0]), np.array(ctx.starts, np.int64))
-    tried: list[tuple[float, float]] = []
-    for j, r in enumerate(grid):
-        column = ctx.to_output(np.ascontiguousarray(every[:, j]))[k]
-        tried.append((least_squares(np.column_stack([straight, column]), residual[k])[1], float(r)))
-    tried.sort()
-    return tuple((r,) for _, r in tried[:3])
+    every = dict(zip(grid.tolist(), stops(x, grid, float(x[0]), np.array(ctx.starts, np.int64)).T, strict=True))
+    column = lambda q: ctx.to_output(np.ascontiguousarray(every[q[0]]))[k]  # noqa: E731
+    return best_starts([(r,) for r in every], column, straight, residual[k])[:3]
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

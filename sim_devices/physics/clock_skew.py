@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, reports, time_settings
 from sim_devices.physics.resampling import delay_by_correlation, resample, resample_straight
 
 
@@ -33,10 +33,6 @@ def local_delays(model: Array, error: Array, keep: np.ndarray, windows: int) -> 
         delay.append(d)
         sd.append(float(np.sqrt(left @ left / k.size / p)))
     return np.array(centre), np.array(delay), np.array(sd)
-
-
-def _skew_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
 
 
 def _skew_parts(settings: Settings) -> Parts:
@@ -73,10 +69,6 @@ def _skew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     return tuple((float(np.clip(v, -5e4, 5e4)),) for v in dict.fromkeys(found))
 
 
-def _skew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("skew_ppm", float(p[0]), "ppm"),)
-
-
 _SMOOTH_SKEW = Effect(
     name="clock_skew",
     summary="one clock runs fast or slow against the other",
@@ -87,10 +79,10 @@ _SMOOTH_SKEW = Effect(
     source="IEEE Std 1588-2019, clause 3 (frequency offset); Keys 1981 for the resampling",
     excitation="quick changes from beginning to end",
     confusable_with=("dropped_samples", "dead_time"),
-    prepare=_skew_prepare,
+    prepare=time_settings,
     guess=_skew_guess,
     apply=_skew_apply,
-    report=_skew_report,
+    report=reports(("skew_ppm", "ppm")),
     sites=("output",),
     vanishes_with=(("skew_ppm", "skew_change_ppm"),),
     essential=("skew_ppm",),

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, reports
 from sim_devices.physics.statistics import least_squares, thin, value_range
 
 KNOTS = 9
@@ -120,10 +120,6 @@ def _fold_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return size * np.abs(x / size) ** q[0] + q[1]
 
 
-def _fold_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("power", float(p[0]), "1"), Human("zero", float(p[1]), "{out}"))
-
-
 _CURVE = Effect(
     name="static_nonlinearity",
     summary="memoryless curvature of one axis' own input-output line",
@@ -152,7 +148,7 @@ _FOLD = replace(
     guess=_fold_guess,
     basis=None,
     apply=_fold_apply,
-    report=_fold_report,
+    report=reports(("power", "1"), ("zero", "{out}")),
     sites=("output",),
     vanishes_with=(("power",),),
 )

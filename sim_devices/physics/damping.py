@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import SPRING
+from sim_devices.physics.effect import Array, Context, Effect, Parameter, Parts, Settings, reports
+from sim_devices.physics.forces import SPRING, packed
 from sim_devices.physics.friction import velocity_of
-
-
-def _row(at: int, weights: Array) -> dict[str, Array]:
-    row = np.zeros(SPRING)
-    row[at] = weights[0]
-    return {"spring": row}
 
 
 def _drag_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     v = velocity_of(x, ctx)
     return (-np.abs(v) * v)[:, None]
-
-
-def _drag_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("quadratic_drag", float(p[0]) / (scale or 1.0), "{in} s^2/{out}^2"),)
 
 
 QUADRATIC_DRAG = Effect(
@@ -37,17 +25,9 @@ QUADRATIC_DRAG = Effect(
     excitation="slow and fast motion",
     confusable_with=("coulomb_friction", "amplitude_dependent_damping"),
     basis=_drag_basis,
-    fill=lambda q, w, settings: _row(4, w),
-    report=_drag_report,
+    fill=lambda q, w, settings: packed("spring", SPRING, {4: w[0]}),
+    report=reports(("quadratic_drag", "{in} s^2/{out}^2"), by_gain=True),
 )
-
-
-def _amplitude_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return (-x * x * velocity_of(x, ctx))[:, None]
-
-
-def _amplitude_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("damping_per_square", float(p[0]) / (scale or 1.0), "{in} s/{out}^3"),)
 
 
 AMPLITUDE_DAMPING = Effect(
@@ -60,7 +40,7 @@ AMPLITUDE_DAMPING = Effect(
     source="B. van der Pol, Phil. Mag. 2 (1926) 978, eq. 1",
     excitation="small and large amplitudes near the resonance",
     confusable_with=("quadratic_drag", "coulomb_friction", "hysteresis"),
-    basis=_amplitude_basis,
-    fill=lambda q, w, settings: _row(5, w),
-    report=_amplitude_report,
+    basis=lambda x, ctx, q, settings: (-x * x * velocity_of(x, ctx))[:, None],
+    fill=lambda q, w, settings: packed("spring", SPRING, {5: w[0]}),
+    report=reports(("damping_per_square", "{in} s/{out}^3"), by_gain=True),
 )

@@ -7,11 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import least_squares, thin, value_range
-
-
-def _range_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"range": value_range(x)}
+from sim_devices.physics.statistics import best_starts, thin, value_range
 
 
 def _dead_parts(settings: Settings) -> Parts:
@@ -34,16 +30,11 @@ def _dead_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     lo, hi = settings["range"]
     span = hi - lo
     k = thin(ctx.keep, 4000)
-    r = residual[k]
-    straight = ctx.line(x, k)
-    tried: list[tuple[float, float, float]] = []
-    centres = [*np.linspace(lo + 0.1 * span, hi - 0.1 * span, 9), *([0.0] if lo < 0 < hi else [])]
-    for h in span * np.geomspace(0.01, 0.3, 8):
-        for c in centres:
-            column = ctx.to_output(-np.clip(x - c, -h, h))[k]
-            tried.append((least_squares(np.column_stack([straight, column]), r)[1], float(h), float(c)))
-    tried.sort()
-    return tuple((h, c) for _, h, c in tried[:3])
+    centres = [*np.linspace(lo + 0.1 * span, hi - 0.1 * span, 9).tolist(), *([0.0] if lo < 0 < hi else [])]
+    grid = [(h, c) for h in (span * np.geomspace(0.01, 0.3, 8)).tolist() for c in centres]
+    return best_starts(grid, lambda q: ctx.to_output(-np.clip(x - q[1], -q[0], q[0]))[k], ctx.line(x, k), residual[k])[
+        :3
+    ]
 
 
 def _dead_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -65,7 +56,7 @@ DEAD_ZONE = Effect(
     source="H. K. Khalil, Nonlinear Systems, 3rd ed., section 1.2.7",
     excitation="inputs that pass through the zone and go well beyond it",
     confusable_with=("static_nonlinearity", "backlash", "coulomb_friction"),
-    prepare=_range_settings,
+    prepare=lambda x, residual, ctx: {"range": value_range(x)},
     guess=_dead_guess,
     basis=_dead_basis,
     report=_dead_report,

@@ -7,12 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Parameter, Parts, Settings, reports, time_settings
 from sim_devices.physics.resampling import delay_by_correlation, resample, resample_straight
-
-
-def _delay_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
 
 
 def _delay_parts(settings: Settings) -> Parts:
@@ -45,12 +41,6 @@ def _delay_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
     return tuple((float(np.clip(d, bounds.lo, bounds.hi)),) for d in dict.fromkeys(found))
 
 
-def _delay_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("delay_s", float(p[0]), "s"),)
-
-
-_DELAY_SOURCE = "A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, 3rd ed., section 4.5; Keys 1981"
-
 _STRAIGHT = r"y(t) = x(t - T),\; x \text{ straight between samples}"
 
 _SMOOTH_DELAY = Effect(
@@ -60,13 +50,13 @@ _SMOOTH_DELAY = Effect(
     stages=("acquisition", "amplifier", "actuator", "sensor"),
     parts=_delay_parts,
     equation=r"y(t) = x(t - T)",
-    source=_DELAY_SOURCE,
+    source="A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, 3rd ed., section 4.5; Keys 1981",
     excitation="quick changes; several frequencies tell it from a lag",
     confusable_with=("first_order_lag", "channel_delay", "clock_skew"),
-    prepare=_delay_prepare,
+    prepare=time_settings,
     guess=_delay_guess,
     apply=_delay_apply,
-    report=_delay_report,
+    report=reports(("delay_s", "s")),
     vanishes_with=(("delay_s",),),
     essential=("delay_s",),
 )
@@ -75,23 +65,15 @@ _SMOOTH_DELAY = Effect(
 _STRAIGHT_DELAY = replace(_SMOOTH_DELAY, parts=_straight_delay_parts, equation=_STRAIGHT, apply=_straight_delay_apply)
 DEAD_TIME = replace(_SMOOTH_DELAY, variants=(_STRAIGHT_DELAY,))
 
-_SMOOTH_CHANNEL = Effect(
+_SMOOTH_CHANNEL = replace(
+    _SMOOTH_DELAY,
     name="channel_delay",
     summary="one channel late against the others",
-    kind="linear",
     stages=("acquisition",),
-    parts=_delay_parts,
     equation=r"y_i(t) = x_i(t - T_i)",
-    source=_DELAY_SOURCE,
     excitation="quick changes seen by several channels",
     confusable_with=("dead_time", "first_order_lag"),
-    prepare=_delay_prepare,
-    guess=_delay_guess,
-    apply=_delay_apply,
-    report=_delay_report,
     sites=("output",),
-    vanishes_with=(("delay_s",),),
-    essential=("delay_s",),
 )
 
 _STRAIGHT_CHANNEL = replace(

@@ -172,10 +172,6 @@ def _drop_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     return {"at": tuple(map(float, at)), "shift": tuple(map(float, total))}
 
 
-def _drop_parts(settings: Settings) -> Parts:
-    return Parts()
-
-
 def _drop_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     at = np.array(settings.get("at", ()), np.int64)
     return shift_by(x, at, np.array(settings.get("shift", ()), np.int64))
@@ -203,7 +199,7 @@ DROPPED_SAMPLES = Effect(
     summary="samples lost or repeated, the rest of the record shifts",
     kind="linear",
     stages=("acquisition",),
-    parts=_drop_parts,
+    parts=lambda settings: Parts(),
     equation=r"y_k = x_{k + s(k)},\; s \text{ jumps where samples are lost or repeated}",
     source="A. J. Viterbi, IEEE Trans. Information Theory 13 (1967) 260, for the path of shifts",
     excitation="quick changes all along the record",

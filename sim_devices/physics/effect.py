@@ -190,6 +190,24 @@ def no_start(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seq
     return ((),)
 
 
+def time_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    """Return the settings of an effect that reads the time step and the length of the record, both in s."""
+    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
+
+
+def reports(*rows: tuple[str, str], by_gain: bool = False) -> Report:
+    """Return the report of an effect whose first parameters are human ones, ``rows`` of (name, unit).
+
+    ``by_gain``: the values are at the output and are reported at the input.
+    """
+
+    def report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+        g = (scale or 1.0) if by_gain else 1.0
+        return tuple(Human(name, float(v) / g, unit) for (name, unit), v in zip(rows, p, strict=False))
+
+    return report
+
+
 @dataclass(frozen=True)
 class Effect:
     """Defines an effect of the vocabulary.

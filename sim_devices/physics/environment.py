@@ -12,22 +12,13 @@ from sim_devices.physics.lag import low_pass
 from sim_devices.physics.statistics import least_squares, thin
 
 
-def _varies(name: str, signals: Mapping[str, Array]) -> str:
+def _varies(name: str, signals: Mapping[str, Array], output: str) -> str:
     if name not in signals:
         return f"{name} not recorded"
     return "" if float(np.ptp(signals[name])) > 0 else f"{name} never changes"
 
 
-def _gain_column(x: Array, change: Array, centre: float) -> Array:
-    """Return the column of a sensitivity change about the middle of the input range, so that it changes no offset."""
-    return (x - centre) * change
-
-
 # -- temperature ------------------------------------------------------------------------------------
-
-
-def _temp_available(signals: Mapping[str, Array], output: str) -> str:
-    return _varies("temperature", signals)
 
 
 def _prepare(signal: str, x: Array, residual: Array, ctx: Context) -> Settings:
@@ -61,7 +52,8 @@ def _basis(signal: str, x: Array, ctx: Context, q: Array, settings: Settings) ->
         d = low_pass(np.ascontiguousarray(d), ctx.dt, q[0], np.array(ctx.starts))
     cols = [d, d * d]
     if settings.get("gain", (1.0,))[0]:
-        cols.append(_gain_column(x, d, settings.get("centre", (0.0,))[0]))
+        # about the middle of the input range, so that a change of sensitivity changes no offset
+        cols.append((x - settings.get("centre", (0.0,))[0]) * d)
     return np.stack(cols, axis=1)
 
 
@@ -109,15 +101,11 @@ TEMPERATURE_SENSITIVITY = Effect(
     report=_temp_report,
     sites=("output",),
     needs=("temperature",),
-    available=_temp_available,
+    available=partial(_varies, "temperature"),
     vanishes_with=(("bias_per_K", "bias_per_K2", "scale_per_K"),),
 )
 
 # -- supply -----------------------------------------------------------------------------------------
-
-
-def _supply_available(signals: Mapping[str, Array], output: str) -> str:
-    return _varies("supply", signals)
 
 
 def _supply_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -149,7 +137,7 @@ SUPPLY_SENSITIVITY = Effect(
     report=_supply_report,
     sites=("output",),
     needs=("supply",),
-    available=_supply_available,
+    available=partial(_varies, "supply"),
     vanishes_with=(("bias_per_V", "bias_per_V2", "scale_per_V", "ratiometric_share"),),
 )
 
@@ -162,11 +150,7 @@ def _current_name(signals: Mapping[str, Array]) -> str:
 
 def _current_available(signals: Mapping[str, Array], output: str) -> str:
     name = _current_name(signals)
-    return _varies(name, signals) if name else "no actuator current recorded"
-
-
-def _current_parts(settings: Settings) -> Parts:
-    return Parts((), (Parameter("per_A", "{out}/A"), Parameter("per_A2", "{out}/A^2")), np.diag([0.02, 0.1]))
+    return _varies(name, signals, output) if name else "no actuator current recorded"
 
 
 def _current_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
@@ -187,7 +171,9 @@ CURRENT_COUPLING = Effect(
     summary="field or voltage that follows a recorded actuator current",
     kind="add",
     stages=("environment", "acquisition"),
-    parts=_current_parts,
+    parts=lambda settings: Parts(
+        (), (Parameter("per_A", "{out}/A"), Parameter("per_A2", "{out}/A^2")), np.diag([0.02, 0.1])
+    ),
     equation=r"y = x + a I + b I^2",
     source="J. D. Jackson, Classical Electrodynamics, 3rd ed., eq. 5.4 (Biot-Savart: field proportional to current)",
     excitation="a current that changes apart from the field",

@@ -6,6 +6,8 @@ One packed row of numbers per family, so that one compiled loop serves every com
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from hal.compiled import kernel
@@ -20,6 +22,13 @@ UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the re
 COGGING = 7  # period, sin1, cos1, sin2, cos2; sine and cosine of the angle itself (gravity)
 FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
 ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
+
+
+def packed(family: str, size: int, at: Mapping[int, float]) -> dict[str, Array]:
+    """Return the row of a family, ``size`` numbers, that is zero but for the numbers ``at`` their places."""
+    row = np.zeros(size)
+    row[list(at)] = list(at.values())
+    return {family: row}
 
 
 @kernel

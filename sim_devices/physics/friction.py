@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import FRICTION, base_moves, loop_along
+from sim_devices.physics.forces import FRICTION, base_moves, loop_along, packed
 from sim_devices.physics.hysteresis import dahl
-from sim_devices.physics.statistics import least_squares, smooth, thin
+from sim_devices.physics.statistics import Start, best_starts, smooth, thin
 
 
 def velocity_of(x: Array, ctx: Context) -> Array:
@@ -42,11 +43,7 @@ _UNIT = "{out}/s^2"
 def _coulomb_parts(settings: Settings) -> Parts:
     return Parts(
         (),
-        (
-            Parameter("level", _UNIT, 0.0),
-            Parameter("asymmetry", _UNIT),
-            Parameter("viscous_asymmetry", "1/s"),
-        ),
+        (Parameter("level", _UNIT, 0.0), Parameter("asymmetry", _UNIT), Parameter("viscous_asymmetry", "1/s")),
         np.diag([0.0, 0.05, 0.05]),
     )
 
@@ -55,12 +52,6 @@ def _coulomb_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Arra
     v = velocity_of(x, ctx)
     s = soft_sign(v)
     return -np.stack([s, s * s, np.abs(v)], axis=1)
-
-
-def _coulomb_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0], row[1], row[4] = w
-    return {"friction": row}
 
 
 def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -90,19 +81,12 @@ def _bent(x: Array, ctx: Context, distance: float) -> Array:
     return dahl(u, np.array([distance]), np.zeros(1), float(u[0]), at)[:, 0] / distance
 
 
-def _lugre_parts(settings: Settings) -> Parts:
-    return Parts((_bristle_distance(settings),), (Parameter("level", _UNIT, 0.0),))
-
-
 def _lugre_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return -_bent(x, ctx, q[0])[:, None]
 
 
 def _lugre_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0] = w[0]
-    row[5] = max(w[0], 0.0) / q[0]
-    return {"friction": row}
+    return packed("friction", FRICTION, {0: w[0], 5: max(w[0], 0.0) / q[0]})
 
 
 def _lugre_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -112,12 +96,16 @@ def _lugre_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
 
 def _best_bristles(x: Array, residual: Array, ctx: Context, grid: Array) -> list[float]:
     """Rank the presliding distances of ``grid`` by how well their force fits the residual, best first."""
+    return [r for (r,) in _best(lambda q: -_bent(x, ctx, q[0]), [(r,) for r in grid.tolist()], residual, ctx)]
+
+
+def _best(
+    force: Callable[[Start], Array], grid: Sequence[Start], residual: Array, ctx: Context, beside: Sequence[Array] = ()
+) -> list[Start]:
+    """Rank the starts of ``grid`` by how well their force and the changes ``beside`` fit the residual, best first."""
     k = thin(ctx.keep, 8000)
-    tried: list[tuple[float, float]] = []
-    for r in grid.tolist():
-        column = ctx.to_output(np.ascontiguousarray(-_bent(x, ctx, r)))[k]
-        tried.append((least_squares(np.column_stack([np.ones(k.size), column]), residual[k])[1], r))
-    return [r for _, r in sorted(tried)]
+    line = np.column_stack([np.ones(k.size), *(c[k] for c in beside)])
+    return best_starts(grid, lambda q: ctx.to_output(np.ascontiguousarray(force(q)))[k], line, residual[k])
 
 
 def _lugre_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -182,24 +170,10 @@ def _loop_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return (-bent / q[0])[:, None]
 
 
-def _loop_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0], row[5] = w[0], max(w[0], 0.0) / q[0]
-    # zero is the mark of a row without a lean
-    row[6] = float(q[1]) if q[1] != 0.0 else 1e-12
-    return {"friction": row}
-
-
 def _loop_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    k = thin(ctx.keep, 8000)
-    tried: list[tuple[float, float, float]] = []
-    for r in (settings["travel"][0] * np.geomspace(0.05, 0.8, 4)).tolist():
-        for lean in LEANS:
-            column = ctx.to_output(np.ascontiguousarray(_loop_basis(x, ctx, np.array([r, lean]), settings)[:, 0]))[k]
-            lines = [np.ones(k.size), *(c[k] for c in base_moves(x, ctx)[1:3])]
-            misfit = least_squares(np.column_stack([*lines, column]), residual[k])[1]
-            tried.append((misfit if np.isfinite(misfit) else np.inf, r, lean))
-    return tuple((r, lean) for _, r, lean in sorted(tried)[:2])
+    grid = [(r, lean) for r in (settings["travel"][0] * np.geomspace(0.05, 0.8, 4)).tolist() for lean in LEANS]
+    force = lambda q: _loop_basis(x, ctx, np.array(q), settings)[:, 0]  # noqa: E731
+    return _best(force, grid, residual, ctx, base_moves(x, ctx)[1:3])[:2]
 
 
 def _loop_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -219,28 +193,42 @@ BOUC_WEN = replace(
     source="Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1 (beta = 1/r, gamma = lambda/r)",
     guess=_loop_guess,
     basis=_loop_basis,
-    fill=_loop_fill,
+    # zero is the mark of a row without a lean
+    fill=lambda q, w, settings: packed(
+        "friction", FRICTION, {0: w[0], 5: max(w[0], 0.0) / q[0], 6: float(q[1]) if q[1] != 0.0 else 1e-12}
+    ),
     report=_loop_report,
     vanishes_with=(("presliding_stiffness",),),
 )
 
 _LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"
 
-_BRISTLES = Effect(
+_COULOMB = Effect(
     name="coulomb_friction",
-    summary="constant force against the motion, behind bristles that give way over a small distance",
+    summary="constant force against the motion",
     kind="feedback",
     stages=("mechanics",),
-    parts=_lugre_parts,
+    parts=_coulomb_parts,
+    equation=r"m\ddot x = F - F_c\,\mathrm{sgn}\,\dot x - \Delta F - \Delta c\,|\dot x|",
+    source=_FRICTION_SOURCE,
+    excitation="reversals of motion, at speeds that differ",
+    prepare=_no_settings,
+    basis=_coulomb_basis,
+    fill=lambda q, w, settings: packed("friction", FRICTION, {0: w[0], 1: w[1], 4: w[2]}),
+    report=_coulomb_report,
+    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
+)
+_BRISTLES = replace(
+    _COULOMB,
+    summary="constant force against the motion, behind bristles that give way over a small distance",
+    parts=lambda settings: Parts((_bristle_distance(settings),), (Parameter("level", _UNIT, 0.0),)),
     equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z / F_c",
     source=_LUGRE_SOURCE + "; P. R. Dahl, AIAA J. 14 (1976) 1675",
-    excitation="reversals of motion, at speeds that differ",
     prepare=_bristle_settings,
     guess=_lugre_guess,
     basis=_lugre_basis,
     fill=_lugre_fill,
     report=_lugre_report,
-    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
 
@@ -257,19 +245,9 @@ def _gentle_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array
     return (-soft_sign(v) * (1.0 - np.exp(-((v / q[0]) ** 2))))[:, None]
 
 
-def _gentle_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0], row[2], row[3] = w[0], -w[0], q[0]
-    return {"friction": row}
-
-
 def _gentle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    k = thin(ctx.keep, 8000)
-    tried: list[tuple[float, float]] = []
-    for full in settings["speed"][0] * np.geomspace(0.01, 0.4, 6):
-        column = ctx.to_output(np.ascontiguousarray(_gentle_basis(x, ctx, np.array([full]), settings)[:, 0]))[k]
-        tried.append((least_squares(np.column_stack([np.ones(k.size), column]), residual[k])[1], float(full)))
-    return tuple((full,) for _, full in sorted(tried)[:2])
+    grid = [(full,) for full in (settings["speed"][0] * np.geomspace(0.01, 0.4, 6)).tolist()]
+    return _best(lambda q: _gentle_basis(x, ctx, np.array(q), settings)[:, 0], grid, residual, ctx)[:2]
 
 
 def _gentle_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -281,39 +259,23 @@ def _gentle_report(p: Array, settings: Settings, scale: float) -> Sequence[Human
     )
 
 
-_GENTLE = Effect(
-    name="coulomb_friction",
+_GENTLE = replace(
+    _COULOMB,
     summary="constant force against the motion, which sets in smoothly around rest",
-    kind="feedback",
-    stages=("mechanics",),
     parts=_gentle_parts,
     equation=r"m\ddot x = F - F_c (1 - e^{-(\dot x/v_0)^2})\,\mathrm{sgn}\,\dot x",
     source=_FRICTION_SOURCE + "; smooth around rest as every simulator has it (tanh, arctan and the like)",
-    excitation="reversals of motion, at speeds that differ",
     prepare=_no_settings,
     guess=_gentle_guess,
     basis=_gentle_basis,
-    fill=_gentle_fill,
+    fill=lambda q, w, settings: packed("friction", FRICTION, {0: w[0], 2: -w[0], 3: q[0]}),
     report=_gentle_report,
-    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
-COULOMB_FRICTION = Effect(
-    name="coulomb_friction",
-    summary="constant force against the motion",
-    kind="feedback",
-    stages=("mechanics",),
-    parts=_coulomb_parts,
-    equation=r"m\ddot x = F - F_c\,\mathrm{sgn}\,\dot x - \Delta F - \Delta c\,|\dot x|",
-    source=_FRICTION_SOURCE,
-    excitation="reversals of motion, at speeds that differ",
+COULOMB_FRICTION = replace(
+    _COULOMB,
     confusable_with=("stribeck_friction", "backlash", "hysteresis", "dead_zone"),
-    prepare=_no_settings,
-    basis=_coulomb_basis,
-    fill=_coulomb_fill,
-    report=_coulomb_report,
     variants=(_BRISTLES, _GENTLE),
-    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
 
@@ -321,12 +283,7 @@ def _stribeck_parts(settings: Settings) -> Parts:
     speed = settings.get("speed", (1.0,))[0]
     return Parts(
         (Parameter("stribeck_speed", "{out}/s", 1e-3 * speed, 2 * speed, log=True, scale=0.05 * speed),),
-        (
-            Parameter("level", _UNIT, 0.0),
-            Parameter("asymmetry", _UNIT),
-            Parameter("viscous_asymmetry", "1/s"),
-            Parameter("extra", _UNIT, 0.0),
-        ),
+        (*_coulomb_parts(settings).weights, Parameter("extra", _UNIT, 0.0)),
         np.diag([0.0, 0.05, 0.05, 0.0]),
     )
 
@@ -335,13 +292,6 @@ def _stribeck_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Arr
     v = velocity_of(x, ctx)
     extra = -soft_sign(v) * np.exp(-((v / q[0]) ** 2))
     return np.column_stack([_coulomb_basis(x, ctx, q, settings), extra])
-
-
-def _stribeck_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0], row[1], row[4], row[2] = w
-    row[3] = q[0]
-    return {"friction": row}
 
 
 def _tustin_parts(settings: Settings) -> Parts:
@@ -354,24 +304,15 @@ def _tustin_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array
     return np.column_stack([_coulomb_basis(x, ctx, q, settings), -soft_sign(v) * np.exp(-np.abs(v) / q[0])])
 
 
-def _tustin_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = _stribeck_fill(q, w, settings)["friction"]
-    row[7] = 1.0
-    return {"friction": row}
+def _stribeck_fill(q: Array, w: Array, settings: Settings, law: float = 0.0) -> dict[str, Array]:
+    return packed("friction", FRICTION, {0: w[0], 1: w[1], 4: w[2], 2: w[3], 3: q[0], 7: law})
 
 
 def _stribeck_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    speed = settings["speed"][0]
-    k = thin(ctx.keep, 8000)
-    common = [np.ones(x.size), *_coulomb_basis(x, ctx, np.zeros(1), settings).T]
-    base = np.stack([common[0], *(ctx.to_output(c) for c in common[1:])], axis=1)[k]
-    tried: list[tuple[float, float]] = []
-    for vs in speed * np.geomspace(0.01, 1.0, 8):
-        extra = _stribeck_basis(x, ctx, np.array([vs]), settings)[:, 3]
-        column = ctx.to_output(np.ascontiguousarray(extra))[k]
-        tried.append((least_squares(np.column_stack([base, column]), residual[k])[1], float(vs)))
-    tried.sort()
-    return tuple((vs,) for _, vs in tried[:2])
+    coulomb = [ctx.to_output(c) for c in _coulomb_basis(x, ctx, np.zeros(1), settings).T]
+    grid = [(vs,) for vs in (settings["speed"][0] * np.geomspace(0.01, 1.0, 8)).tolist()]
+    extra = lambda q: _stribeck_basis(x, ctx, np.array(q), settings)[:, 3]  # noqa: E731
+    return _best(extra, grid, residual, ctx, coulomb)[:2]
 
 
 def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -396,13 +337,6 @@ def _stribeck_bristle_basis(x: Array, ctx: Context, q: Array, settings: Settings
     return -np.stack([bent, bent * np.exp(-((v / q[0]) ** 2))], axis=1)
 
 
-def _stribeck_bristle_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(FRICTION)
-    row[0], row[2], row[3] = w[0], w[1], q[0]
-    row[5] = max(w[0], 0.0) / q[1]
-    return {"friction": row}
-
-
 def _stribeck_bristle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     travel = settings["travel"][0]
     near = _best_bristles(x, residual, ctx, travel * np.geomspace(5e-4, 0.015, 5))[0]
@@ -419,25 +353,6 @@ def _stribeck_bristle_report(p: Array, settings: Settings, scale: float) -> Sequ
         Human("presliding_distance", float(p[1]), "{out}"),
     )
 
-
-_STRIBECK_BRISTLES = Effect(
-    name="stribeck_friction",
-    summary="friction that falls as motion starts, behind bristles that give way over a small distance",
-    kind="feedback",
-    stages=("mechanics",),
-    parts=_stribeck_bristle_parts,
-    equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z /"
-    r" (F_c + F_s e^{-(\dot x/v_s)^2})",
-    source=_LUGRE_SOURCE,
-    excitation="slow motion and reversals, beside fast motion",
-    prepare=_bristle_settings,
-    guess=_stribeck_bristle_guess,
-    basis=_stribeck_bristle_basis,
-    fill=_stribeck_bristle_fill,
-    report=_stribeck_bristle_report,
-    vanishes_with=(("static_friction",),),
-    plain="coulomb_friction",
-)
 
 _SQUARED = Effect(
     name="stribeck_friction",
@@ -464,7 +379,21 @@ _TUSTIN = replace(
     equation=r"m\ddot x = F - \left(F_c + F_s e^{-|\dot x|/v_s}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
     source="A. Tustin, J. IEE 94 IIA (1947) 143; " + _FRICTION_SOURCE,
     basis=_tustin_basis,
-    fill=_tustin_fill,
+    fill=partial(_stribeck_fill, law=1.0),
+)
+
+_STRIBECK_BRISTLES = replace(
+    _SQUARED,
+    summary="friction that falls as motion starts, behind bristles that give way over a small distance",
+    parts=_stribeck_bristle_parts,
+    equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z /"
+    r" (F_c + F_s e^{-(\dot x/v_s)^2})",
+    source=_LUGRE_SOURCE,
+    prepare=_bristle_settings,
+    guess=_stribeck_bristle_guess,
+    basis=_stribeck_bristle_basis,
+    fill=lambda q, w, settings: packed("friction", FRICTION, {0: w[0], 2: w[1], 3: q[0], 5: max(w[0], 0.0) / q[1]}),
+    report=_stribeck_bristle_report,
 )
 
 STRIBECK_FRICTION = replace(_SQUARED, confusable_with=("coulomb_friction",), variants=(_TUSTIN, _STRIBECK_BRISTLES))

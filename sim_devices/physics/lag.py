@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hal.compiled import kernel
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, time_settings
 from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.statistics import rank_starts, thin
 
@@ -40,10 +40,6 @@ def _parts(settings: Settings) -> Parts:
     return Parts((Parameter("time_constant_s", "s", 0.02 * dt, 0.5 * span, log=True, scale=dt),))
 
 
-def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
-
-
 def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return low_pass(x, ctx.dt, q[0], np.array(ctx.starts))
 
@@ -70,7 +66,7 @@ FIRST_ORDER_LAG = Effect(
     source="A. V. Oppenheim, A. S. Willsky, Signals and Systems, 2nd ed., section 6.5.1",
     excitation="frequencies around 1/(2 pi tau); two of them tell it from a pure delay",
     confusable_with=("dead_time", "resonance", "creep", "slew_limit"),
-    prepare=_prepare,
+    prepare=time_settings,
     guess=_guess,
     apply=_apply,
     report=_report,
@@ -169,7 +165,7 @@ _ONCE = Effect(
     source="A. V. Oppenheim, A. S. Willsky, Signals and Systems, 2nd ed., section 6.5.1",
     excitation="changes of the mean that last longer than the time constant",
     confusable_with=("creep", "thermal_drift"),
-    prepare=_prepare,
+    prepare=time_settings,
     guess=_ac_guess,
     apply=_ac_apply,
     report=_report,

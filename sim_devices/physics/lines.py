@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -174,10 +175,6 @@ def _line_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return np.concatenate([c[:, j : j + 1] * h for j in range(c.shape[1])], axis=1)
 
 
-def _line_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    return ((settings["nominal"][0],),)
-
-
 def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     knots = len(settings.get("knots_s", (0.0,)))
     orders = settings["orders"]
@@ -246,20 +243,18 @@ def _vibration_test(x: Array, residual: Array, ctx: Context) -> Signature:
     return _line_signature(z, f, ctx.t.size, residual, ctx)
 
 
-_LINE = r"y = x + \sum_h A_h(t) \sin 2\pi h f t + B_h(t) \cos 2\pi h f t,\; A, B \text{ slow}"
-
 MAINS_INTERFERENCE = Effect(
     name="mains_interference",
     summary="50 or 60 Hz and harmonics",
     kind="add",
     stages=("acquisition", "environment"),
     parts=_line_parts,
-    equation=_LINE,
+    equation=r"y = x + \sum_h A_h(t) \sin 2\pi h f t + B_h(t) \cos 2\pi h f t,\; A, B \text{ slow}",
     source="H. W. Ott, Electromagnetic Compatibility Engineering, chapters 2-3; IEC 61000-4-7 for harmonics",
     excitation="a sampling rate above 100 Hz",
     confusable_with=("vibration",),
     prepare=_mains_prepare,
-    guess=_line_guess,
+    guess=lambda x, residual, ctx, settings: ((settings["nominal"][0],),),
     basis=_line_basis,
     test=_mains_test,
     report=_line_report,
@@ -268,24 +263,16 @@ MAINS_INTERFERENCE = Effect(
     vanishes_with=(("amplitude_*",),),
 )
 
-VIBRATION = Effect(
+VIBRATION = replace(
+    MAINS_INTERFERENCE,
     name="vibration",
     summary="a narrow line elsewhere in the spectrum, not driven by the input",
-    kind="add",
     stages=("environment", "mounting", "mechanics"),
-    parts=_line_parts,
-    equation=_LINE,
     source="M. B. Priestley, Spectral Analysis and Time Series, section 6.1.4 (Fisher's test for a line)",
     excitation="an input without lines near that frequency",
     confusable_with=("mains_interference", "resonance"),
     prepare=_vibration_prepare,
-    guess=_line_guess,
-    basis=_line_basis,
     test=_vibration_test,
-    report=_line_report,
-    driven=False,
-    sites=("output",),
     # a mains line that wanders has skirts beside the band where its own search looks
     forbidden={"frequency_Hz": tuple((0.99 * m, 1.01 * m) for m in MAINS_HZ)},
-    vanishes_with=(("amplitude_*",),),
 )

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import SPRING
+from sim_devices.physics.effect import Effect, Parameter, Parts, reports
+from sim_devices.physics.forces import SPRING, packed
 
 SOURCE = (
     "A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System"
     " Identification Benchmarks (2019), eq. 1 (the offset)"
 )
-
-
-def _fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(SPRING)
-    row[9] = w[0]
-    return {"spring": row}
-
-
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.ones((x.size, 1))
-
-
-def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("load", float(p[0]) / (scale or 1.0), "{in}"),)
 
 
 AT_INPUT = Effect(
@@ -39,8 +23,8 @@ AT_INPUT = Effect(
     equation=r"u' = u + u_0",
     source=SOURCE,
     excitation="motion both ways, without anything that holds the position",
-    basis=_basis,
-    report=_report,
+    basis=lambda x, ctx, q, settings: np.ones((x.size, 1)),
+    report=reports(("load", "{in}"), by_gain=True),
     driven=False,
     shifts_line=True,
 )
@@ -55,9 +39,9 @@ CONSTANT_LOAD = Effect(
     source=SOURCE,
     excitation="motion both ways, without anything that holds the position",
     confusable_with=("coulomb_friction", "thermal_drift", "step_shift"),
-    basis=_basis,
-    fill=_fill,
-    report=_report,
+    basis=lambda x, ctx, q, settings: np.ones((x.size, 1)),
+    fill=lambda q, w, settings: packed("spring", SPRING, {9: w[0]}),
+    report=reports(("load", "{in}"), by_gain=True),
     acts_on=("motion", "storage"),
     variants=(AT_INPUT,),
 )

@@ -25,11 +25,6 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return (x - settings["centre"][0])[:, None]
 
 
-def _fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    parameter, signal = settings[PAIRS]
-    return {"sway": np.array([parameter, signal, w[0], settings["centre"][0], 0.0])}
-
-
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (
         Human("relative_change", float(p[0]), "1/{out}"),
@@ -49,27 +44,10 @@ PARAMETER_VARIATION = Effect(
     confusable_with=("thermal_drift", "temperature_sensitivity"),
     prepare=_settings,
     basis=_basis,
-    fill=_fill,
+    fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], settings["centre"][0], 0.0])},
     report=_report,
     acts_on=("parameter",),
 )
-
-
-def _turned_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0))}
-
-
-def _turned_parts(settings: Settings) -> Parts:
-    return Parts((), (Parameter("relative_change", "1", scale=0.03),))
-
-
-def _turned_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.sign(np.gradient(x, ctx.dt))[:, None]
-
-
-def _turned_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    parameter, state = settings[PAIRS]
-    return {"sway": np.array([parameter, state, w[0], 0.0, 1.0])}
 
 
 def _turned_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -85,14 +63,14 @@ DIRECTION_DEPENDENCE = Effect(
     summary="a parameter of the equations differs with the direction of motion (a valve fills faster than it vents)",
     kind="feedback",
     stages=("mechanics", "actuator", "environment"),
-    parts=_turned_parts,
+    parts=lambda settings: Parts((), (Parameter("relative_change", "1", scale=0.03),)),
     equation=r"p = p_0 (1 + a\,\mathrm{sgn}\,\dot x)",
     source="J. C. Dixon, The Shock Absorber Handbook, 2nd ed. 2007, ch. 6 (asymmetry); the same form for any parameter",
     excitation="slow and fast moves both ways, with rest between them",
     confusable_with=("static_nonlinearity", "hysteresis"),
-    prepare=_turned_settings,
-    basis=_turned_basis,
-    fill=_turned_fill,
+    prepare=lambda x, residual, ctx: {PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0))},
+    basis=lambda x, ctx, q, settings: np.sign(np.gradient(x, ctx.dt))[:, None],
+    fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], 0.0, 1.0])},
     report=_turned_report,
     limits={"relative_change": (-MOST_TURNED, MOST_TURNED)},
     vanishes_with=(("relative_change",),),

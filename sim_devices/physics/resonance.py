@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hal.compiled import kernel
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Parameter, Parts, Settings, reports, time_settings
 from sim_devices.physics.exponential import exponential
 from sim_devices.physics.statistics import least_squares, thin
 
@@ -47,10 +47,6 @@ def mode(x, ad, g0, g1, starts):
         y[0, i] = a
         y[1, i] = b
     return y
-
-
-def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
 
 
 def _parts(settings: Settings) -> Parts:
@@ -101,15 +97,6 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     return [q for _, q in every[:4]]
 
 
-def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (
-        Human("frequency_Hz", float(p[0]), "Hz"),
-        Human("damping_ratio", float(p[1]), "1"),
-        Human("share", float(p[2]), "1"),
-        Human("rate_share", float(p[3]), "1"),
-    )
-
-
 RESONANCE = Effect(
     name="resonance",
     summary="second-order mode",
@@ -120,10 +107,10 @@ RESONANCE = Effect(
     source="D. J. Ewins, Modal Testing, 2nd ed., eq. 2.9",
     excitation="frequencies around the mode; below it, its static part looks like a lag or a lead",
     confusable_with=("first_order_lag", "dead_time", "vibration"),
-    prepare=_prepare,
+    prepare=time_settings,
     guess=_guess,
     apply=_apply,
-    report=_report,
+    report=reports(("frequency_Hz", "Hz"), ("damping_ratio", "1"), ("share", "1"), ("rate_share", "1")),
     # more damping makes a lag
     limits={"damping_ratio": (0.0, 0.5)},
     vanishes_with=(("share", "rate_share"),),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Parameter, Parts, Settings, reports
 from sim_devices.physics.statistics import least_squares, thin
 
 
@@ -45,17 +45,9 @@ def _place(ctx: Context) -> tuple[int, Array]:
     return int(ctx.facts.get("axis", (0.0,))[0]), np.array(ctx.facts.get("position_m", (0.0, 0.0, 0.0)))
 
 
-def _centripetal_parts(settings: Settings) -> Parts:
-    return Parts((), (Parameter("share", "1", -5.0, 5.0),))
-
-
 def _centripetal_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     axis, r = _place(ctx)
     return (centripetal_row(rates(ctx), axis) @ r)[:, None]
-
-
-def _centripetal_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("share", float(p[0]), "1"),)
 
 
 CENTRIPETAL_ACCELERATION = Effect(
@@ -63,13 +55,13 @@ CENTRIPETAL_ACCELERATION = Effect(
     summary="omega x (omega x r)",
     kind="add",
     stages=("mechanics",),
-    parts=_centripetal_parts,
+    parts=lambda settings: Parts((), (Parameter("share", "1", -5.0, 5.0),)),
     equation=r"a = x + c\; e \cdot (\omega \times (\omega \times r))",
     source="H. Goldstein, Classical Mechanics, 3rd ed., eq. 4.91",
     excitation="fast rotation (the term grows with the square of the rate)",
     confusable_with=("sensor_position_error", "cross_axis_nonlinearity"),
     basis=_centripetal_basis,
-    report=_centripetal_report,
+    report=reports(("share", "1")),
     driven=False,
     sites=("output",),
     shared=True,
@@ -106,10 +98,6 @@ def _position_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Arr
     return row
 
 
-def _position_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return [Human(f"displacement_{a}", float(v), "m") for a, v in zip("xyz", p, strict=True)]
-
-
 SENSOR_POSITION_ERROR = Effect(
     name="sensor_position_error",
     summary="a sensor sits elsewhere than believed",
@@ -122,7 +110,7 @@ SENSOR_POSITION_ERROR = Effect(
     confusable_with=("centripetal_acceleration", "misalignment"),
     prepare=_position_prepare,
     basis=_position_basis,
-    report=_position_report,
+    report=reports(*((f"displacement_{a}", "m") for a in "xyz")),
     driven=False,
     sites=("output",),
     shared=True,

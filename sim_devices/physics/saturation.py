@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hal.compiled import kernel
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Parameter, Parts, Settings, reports
 from sim_devices.physics.statistics import rank_starts, thin
 
 
@@ -72,14 +72,6 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     return rank_starts(grid, lambda q: ctx.to_output(limit(x, q[0], q[1], q[2])), wanted, k, ctx.bends)[:4]
 
 
-def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (
-        Human("lower_limit", float(p[0]), "{in}"),
-        Human("upper_limit", float(p[1]), "{in}"),
-        Human("corner", float(p[2]), "{in}"),
-    )
-
-
 SATURATION = Effect(
     name="saturation",
     summary="output limited, hard or soft, at unequal limits",
@@ -93,5 +85,5 @@ SATURATION = Effect(
     prepare=_prepare,
     guess=_guess,
     apply=_apply,
-    report=_report,
+    report=reports(("lower_limit", "{in}"), ("upper_limit", "{in}"), ("corner", "{in}")),
 )

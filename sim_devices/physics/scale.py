@@ -6,15 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Effect, Human, Parameter, Parts, Settings, reports
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (Human("gain", 1.0 + float(p[0]), "1"), Human("gain_error", float(p[0]), "1"))
-
-
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return x[:, None]
 
 
 SCALE_ERROR = Effect(
@@ -27,7 +23,7 @@ SCALE_ERROR = Effect(
     source="IEEE Std 1293-2018, section on the model equation: scale factor error",
     excitation="amplitudes at which the simulation is not linear, or a gain that is known in the simulation",
     confusable_with=("static_nonlinearity", "saturation"),
-    basis=_basis,
+    basis=lambda x, ctx, q, settings: x[:, None],
     report=_report,
     vanishes_with=(("gain_error",),),
     proportional=True,
@@ -46,7 +42,7 @@ ZERO_ERROR = Effect(
     excitation="motion around more than one place, in a simulation that knows where zero is",
     confusable_with=("constant_load", "step_shift", "thermal_drift"),
     basis=lambda x, ctx, q, settings: np.ones((x.size, 1)),
-    report=lambda p, settings, scale: (Human("zero", float(p[0]), "{out}"),),
+    report=reports(("zero", "{out}")),
     driven=False,
     shifts_line=True,
 )

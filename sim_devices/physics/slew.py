@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import least_squares, thin
+from sim_devices.physics.statistics import best_starts, thin
 
 RATES = (1.0, 10.0)  # usual and fastest of the input, where a file does not say
 SUBSTEPS = 8  # where a limited course meets its input again lies between samples, and all that follows hangs on it
@@ -70,15 +70,11 @@ def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     usual, top = settings["rates"]
     k = thin(ctx.keep, 8000)
-    line = ctx.line(x, k)
-    tried: list[tuple[float, tuple[float, float, float]]] = []
-    for rate in np.geomspace(0.03 * usual, top, 24).tolist():
-        for lag in (0.1 * ctx.dt, 0.6 * ctx.dt, 3.0 * ctx.dt, 12.0 * ctx.dt):
-            q = (rate, rate, lag)
-            # against the residual: how a plant that integrates came to where it is, no change of its input says
-            change = ctx.to_output(_slew_apply(x, ctx, np.array(q), settings) - x)[k]
-            tried.append((least_squares(np.column_stack([line, change]), residual[k])[1], q))
-    return [q for _, q in sorted(tried)[:3]]
+    rates = np.geomspace(0.03 * usual, top, 24).tolist()
+    grid = [(rate, rate, lag * ctx.dt) for rate in rates for lag in (0.1, 0.6, 3.0, 12.0)]
+    # against the residual: how a plant that integrates came to where it is, no change of its input says
+    change = lambda q: ctx.to_output(_slew_apply(x, ctx, np.array(q), settings) - x)[k]  # noqa: E731
+    return best_starts(grid, change, ctx.line(x, k), residual[k])[:3]
 
 
 def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

@@ -108,14 +108,6 @@ def claims(settings: Settings, n: int) -> NDArray[np.bool_]:
     return out
 
 
-def _parts(settings: Settings) -> Parts:
-    return Parts()
-
-
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.zeros((ctx.t.size, 0))
-
-
 def _test(x: Array, residual: Array, ctx: Context) -> Signature:
     """Test bursts against heavy-tailed noise: Student's t with 4 degrees of freedom is the null distribution.
 
@@ -168,13 +160,13 @@ SPIKES = Effect(
     summary="short isolated bursts (button press, electrical)",
     kind="add",
     stages=("acquisition", "mounting", "environment"),
-    parts=_parts,
+    parts=lambda settings: Parts(),
     equation=r"y = x + \sum_i b_i(t - t_i),\; b_i \text{ short, of any shape}",
     source="R. K. Pearson, Mining Imperfect Data, SIAM 2005, section 3.2 (robust detection of outliers)",
     excitation="none; the longer the record, the more events",
     confusable_with=("dropped_samples", "quantization", "step_shift"),
     prepare=_prepare,
-    basis=_basis,
+    basis=lambda x, ctx, q, settings: np.zeros((ctx.t.size, 0)),
     test=_test,
     report=_report,
     driven=False,

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from sim_devices.physics.effect import Array, Basis, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves
+from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves, packed
 from sim_devices.physics.friction import velocity_of
-from sim_devices.physics.statistics import least_squares, thin
+from sim_devices.physics.statistics import best_starts, least_squares, thin
 
 MOST_PERIOD = 0.8  # of the travel: what was not seen to come again is a spring
 
@@ -38,12 +38,6 @@ def _spring_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array
     return -np.stack(terms, axis=1)
 
 
-def _spring_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(SPRING)
-    row[: w.size] = w
-    return {"spring": row}
-
-
 def _spring_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
     out = [
@@ -67,26 +61,20 @@ _CUBIC = Effect(
     confusable_with=("static_nonlinearity", "saturation"),
     prepare=_spring_settings,
     basis=_spring_basis,
-    fill=_spring_fill,
+    fill=lambda q, w, settings: packed("spring", SPRING, dict(enumerate(w))),
     report=_spring_report,
     vanishes_with=(("cubic_stiffness", "quadratic_stiffness", "quintic_stiffness"),),
 )
 
 
-def _quintic_parts(settings: Settings) -> Parts:
-    parts = _spring_parts(settings)
-    terms = (*parts.weights, Parameter("quintic", "1/({out}^4 s^2)"))
+def _and(term: Parameter, settings: Settings) -> Parts:
+    """Return the parts of a spring with one term more."""
+    terms = (*_spring_parts(settings).weights, term)
     return Parts((), terms, np.diag([0.0, 0.02, *[0.0] * (len(terms) - 2)]))
 
 
-def _quintic_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.column_stack([_spring_basis(x, ctx, q, settings), -(x**5)])
-
-
-def _quintic_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = _spring_fill(q, w[:-1], settings)["spring"]
-    row[3] = w[-1]
-    return {"spring": row}
+def _and_fill(place: int, q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    return packed("spring", SPRING, {**dict(enumerate(w[:-1])), place: w[-1]})
 
 
 def _quintic_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -96,28 +84,12 @@ def _quintic_report(p: Array, settings: Settings, scale: float) -> Sequence[Huma
 
 _QUINTIC = replace(
     _CUBIC,
-    parts=_quintic_parts,
+    parts=partial(_and, Parameter("quintic", "1/({out}^4 s^2)")),
     equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 x^3 + k_5 x^5 = F",
-    basis=_quintic_basis,
-    fill=_quintic_fill,
+    basis=lambda x, ctx, q, settings: np.column_stack([_spring_basis(x, ctx, q, settings), -(x**5)]),
+    fill=partial(_and_fill, 3),
     report=_quintic_report,
 )
-
-
-def _lossy_parts(settings: Settings) -> Parts:
-    parts = _spring_parts(settings)
-    terms = (*parts.weights, Parameter("loss", "1/({out}^2 s)", 0.0))
-    return Parts((), terms, np.diag([0.0, 0.02, *[0.0] * (len(terms) - 2)]))
-
-
-def _lossy_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.column_stack([_spring_basis(x, ctx, q, settings), -x * x * velocity_of(x, ctx)])
-
-
-def _lossy_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = _spring_fill(q, w[:-1], settings)["spring"]
-    row[5] = w[-1]
-    return {"spring": row}
 
 
 def _lossy_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -128,12 +100,14 @@ def _lossy_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]
 _LOSSY = replace(
     _CUBIC,
     summary="spring that hardens, of a material whose stress follows the rate of its strain, too",
-    parts=_lossy_parts,
+    parts=partial(_and, Parameter("loss", "1/({out}^2 s)", 0.0)),
     equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 (x^3 + 2\tau x^2\dot x) = F",
     source="S. Zaitsev, O. Shtempluck, E. Buks, O. Gottlieb, Nonlinear Dynamics 67 (2012) 859 (Kelvin-Voigt under"
     " the strain x^2 of large deflections)",
-    basis=_lossy_basis,
-    fill=_lossy_fill,
+    basis=lambda x, ctx, q, settings: np.column_stack(
+        [_spring_basis(x, ctx, q, settings), -x * x * velocity_of(x, ctx)]
+    ),
+    fill=partial(_and_fill, 5),
     report=_lossy_report,
 )
 CUBIC_STIFFNESS = replace(_CUBIC, variants=(_QUINTIC, _LOSSY))
@@ -185,13 +159,6 @@ def _cog_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> S
     return tuple((p,) for p in settings.get("periods", (settings["travel"][0] / 4,)))
 
 
-def _cog_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(COGGING)
-    row[0] = q[0]
-    row[1:5] = w
-    return {"cogging": row}
-
-
 def _cog_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
     return (
@@ -214,7 +181,7 @@ COGGING_FORCE = Effect(
     prepare=_cog_prepare,
     guess=_cog_guess,
     basis=_cog_basis,
-    fill=_cog_fill,
+    fill=lambda q, w, settings: packed("cogging", COGGING, dict(enumerate((q[0], *w)))),
     report=_cog_report,
     vanishes_with=(("amplitude_*",),),
     essential=("period",),
@@ -223,20 +190,6 @@ COGGING_FORCE = Effect(
 
 LEAST_TURNED = 0.5
 """Least number of turns over which a load must be seen: over fewer, its sine looks like a softening spring."""
-
-
-def _lever_parts(settings: Settings) -> Parts:
-    return Parts((), (Parameter("sine", "{out}/s^2"), Parameter("cosine", "{out}/s^2")))
-
-
-def _lever_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return np.stack([np.sin(x), np.cos(x)], axis=1)
-
-
-def _lever_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(COGGING)
-    row[5:] = w
-    return {"cogging": row}
 
 
 def _lever_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -252,14 +205,14 @@ GRAVITY_LOAD = Effect(
     summary="weight on a lever that turns: a load that follows the sine of the angle",
     kind="feedback",
     stages=("mechanics",),
-    parts=_lever_parts,
+    parts=lambda settings: Parts((), (Parameter("sine", "{out}/s^2"), Parameter("cosine", "{out}/s^2"))),
     equation=r"J\ddot\varphi = M - m g r \sin(\varphi - \varphi_0)",
     source="M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control, Wiley 2006, chapter 7 (single link)",
     excitation="at least half a turn, slowly",
     confusable_with=("cogging", "cubic_stiffness"),
     prepare=_travel,
-    basis=_lever_basis,
-    fill=_lever_fill,
+    basis=lambda x, ctx, q, settings: np.stack([np.sin(x), np.cos(x)], axis=1),
+    fill=lambda q, w, settings: packed("cogging", COGGING, {5: w[0], 6: w[1]}),
     report=_lever_report,
     position_unit="rad",
     limits={"turns_seen": (LEAST_TURNED, np.inf)},
@@ -279,20 +232,8 @@ def _gap_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return -(d - np.clip(d, -q[0], q[0]))[:, None]
 
 
-def _gap_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(SPRING)
-    row[6], row[7], row[8] = w[0], q[0], q[1]
-    return {"spring": row}
-
-
 def _lost_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return np.clip(x - q[1], -q[0], q[0])[:, None]
-
-
-def _lost_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    row = np.zeros(SPRING)
-    row[2], row[6], row[7], row[8], row[9] = -w[0], w[0], q[0], q[1], -w[0] * q[1]
-    return {"spring": row}
 
 
 def _gap_guess(
@@ -301,13 +242,11 @@ def _gap_guess(
     k = thin(ctx.keep, 8000)
     line = np.stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))], axis=1)
     travel, middle = settings["travel"][0], 0.5 * float(np.max(x[ctx.keep]) + np.min(x[ctx.keep]))
-    tried: list[tuple[float, float, float]] = []
-    for centre in dict.fromkeys((0.0, middle)):
-        for gap in travel * np.array([0.03, 0.1, 0.2, 0.3, 0.4]):
-            column = ctx.to_output(np.ascontiguousarray(basis(x, ctx, np.array([gap, centre]), settings)[:, 0]))[k]
-            tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(gap), centre))
+    grid = [(travel * gap, centre) for centre in dict.fromkeys((0.0, middle)) for gap in (0.03, 0.1, 0.2, 0.3, 0.4)]
+    column = lambda q: ctx.to_output(np.ascontiguousarray(basis(x, ctx, np.array(q), settings)[:, 0]))[k]  # noqa: E731
     size = settings["size"][0]
-    return tuple((gap, float(np.clip(centre, -size, size))) for _, gap, centre in sorted(tried)[:2])
+    best = best_starts(grid, column, line, residual[k])[:2]
+    return tuple((gap, float(np.clip(centre, -size, size))) for gap, centre in best)
 
 
 def _gap_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -331,7 +270,7 @@ _GAP = Effect(
     prepare=_travel,
     guess=_gap_guess,
     basis=_gap_basis,
-    fill=_gap_fill,
+    fill=lambda q, w, settings: packed("spring", SPRING, {6: w[0], 7: q[0], 8: q[1]}),
     report=_gap_report,
 )
 
@@ -340,7 +279,7 @@ _LOST = replace(
     equation=r"F = k\,(d - \max(-g, \min(g, d))),\; d = x_1 - b x_2 - x_0",
     guess=partial(_gap_guess, basis=_lost_basis),
     basis=_lost_basis,
-    fill=_lost_fill,
+    fill=lambda q, w, settings: packed("spring", SPRING, {2: -w[0], 6: w[0], 7: q[0], 8: q[1], 9: -w[0] * q[1]}),
     acts_on=("joint",),
 )
 CLEARANCE = replace(_GAP, variants=(_LOST,))

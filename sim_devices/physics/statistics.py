@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from scipy.signal import lfilter
 from sim_devices.physics.effect import Array
 
 Bool = NDArray[np.bool_]
+Start = TypeVar("Start", bound=tuple[float, ...])
 
 
 def robust_rms(x: Array) -> float:
@@ -183,6 +185,14 @@ def rank_starts(
     found = [(affine_misfit(output_of(q)[k], measured[k], beside), i) for i, q in enumerate(candidates)]
     steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found if np.isfinite(f)]
     return [candidates[i] for _, i in sorted(steps)] or candidates[:1]
+
+
+def best_starts(
+    candidates: Iterable[Start], columns_of: Callable[[Start], Array], line: Array, wanted: Array
+) -> list[Start]:
+    """Rank candidates by how well ``line`` (k, j) and their columns (k,) or (k, m) fit ``wanted`` (k,); best first."""
+    tried = [(least_squares(np.column_stack([line, columns_of(q)]), wanted)[1], q) for q in candidates]
+    return [q for _, q in sorted((misfit if np.isfinite(misfit) else np.inf, q) for misfit, q in tried)]
 
 
 def value_range(x: Array) -> tuple[float, float]:

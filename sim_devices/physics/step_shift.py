@@ -160,10 +160,6 @@ def _step_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     return ((0.5 * ctx.dt,), (float(np.sqrt(ctx.dt * p.hi)),))
 
 
-def _edge_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    return ((0.5 * ctx.dt,),)
-
-
 def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
     """Test the largest CUSUM against the Brownian bridge (Kolmogorov's distribution)."""
     e = residual[ctx.keep]
@@ -278,7 +274,7 @@ _EDGES = replace(
     parts=_edge_parts,
     equation=r"y = x + \sum_i h_i\,\theta(t - t_i),\; t_i \text{ at sharp edges}",
     prepare=_edge_prepare,
-    guess=_edge_guess,
+    guess=lambda x, residual, ctx, settings: ((0.5 * ctx.dt,),),
     test=_edge_test,
 )
 STEP_SHIFT = replace(_LEVELS, variants=(_EDGES,))

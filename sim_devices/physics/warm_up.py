@@ -7,12 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import least_squares, thin
-
-
-def _span(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
+from sim_devices.physics.effect import Array, Basis, Context, Effect, Human, Parameter, Parts, Settings, time_settings
+from sim_devices.physics.statistics import best_starts, thin
 
 
 def _warm_parts(settings: Settings) -> Parts:
@@ -33,31 +29,27 @@ def _warm_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _warm_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     p = _warm_parts(settings).nonlinear[0]
+    taus = np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14).tolist()
+    return _best(_warm_basis, [(tau, ratio) for tau in taus for ratio in (0.05, 0.2)], x, residual, ctx)[:3]
+
+
+def _best(
+    basis: Basis, candidates: Sequence[tuple[float, ...]], x: Array, residual: Array, ctx: Context
+) -> list[tuple[float, ...]]:
     k = thin(ctx.keep, 4000)
-    line = ctx.line(x, k)
-    tried: list[tuple[float, float, float]] = []
-    for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
-        for ratio in (0.05, 0.2):
-            cols = _warm_basis(x, ctx, np.array([tau, ratio]), settings)[k]
-            tried.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(tau), ratio))
-    tried.sort()
-    return tuple((tau, ratio) for _, tau, ratio in tried[:3])
+    return best_starts(candidates, lambda q: basis(x, ctx, np.array(q), {})[k], ctx.line(x, k), residual[k])
 
 
 def _warm_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     span = settings["time"][1]
     t = np.array([0.0, span])
-    change = _exponentials(t, p)
+    change = p[2] * np.exp(-t / p[0]) + p[3] * np.exp(-t / (p[0] * p[1]))
     return (
         Human("drift_over_record", float(change[1] - change[0]), "{out}"),
         Human("time_constant_s", float(p[0] if abs(p[2]) >= abs(p[3]) else p[0] * p[1]), "s"),
         Human("slow_amplitude", float(-p[2]), "{out}"),
         Human("fast_amplitude", float(-p[3]), "{out}"),
     )
-
-
-def _exponentials(t: Array, p: Array) -> Array:
-    return p[2] * np.exp(-t / p[0]) + p[3] * np.exp(-t / (p[0] * p[1]))
 
 
 def _late_parts(settings: Settings) -> Parts:
@@ -77,15 +69,9 @@ def _late_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _late_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     span = settings["time"][1]
-    k = thin(ctx.keep, 4000)
-    line = ctx.line(x, k)
-    tried: list[tuple[float, float, float]] = []
-    for middle in np.linspace(0.0, 1.0, 11) * span:
-        for width in (0.04 * span, 0.12 * span):
-            column = _late_basis(x, ctx, np.array([middle, width]), settings)[k]
-            tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(middle), width))
-    tried.sort()
-    return tuple((middle, width) for _, middle, width in tried[:2])
+    middles = (np.linspace(0.0, 1.0, 11) * span).tolist()
+    grid = [(middle, width) for middle in middles for width in (0.04 * span, 0.12 * span)]
+    return _best(_late_basis, grid, x, residual, ctx)[:2]
 
 
 def _late_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -108,14 +94,8 @@ def _one_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _one_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     p = _warm_parts(settings).nonlinear[0]
-    k = thin(ctx.keep, 4000)
-    line = ctx.line(x, k)
-    tried: list[tuple[float, float]] = []
-    for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
-        column = _one_basis(x, ctx, np.array([tau]), settings)[k]
-        tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(tau)))
-    tried.sort()
-    return tuple((tau,) for _, tau in tried[:2])
+    grid = [(tau,) for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14).tolist()]
+    return _best(_one_basis, grid, x, residual, ctx)[:2]
 
 
 def _one_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -127,28 +107,6 @@ def _one_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     )
 
 
-_LATE = Effect(
-    name="thermal_drift",
-    summary="warm-up that sets in late: slow, then faster, then settled (logistic)",
-    kind="add",
-    stages=("environment", "sensor", "acquisition"),
-    parts=_late_parts,
-    equation=r"y = x + a / (1 + e^{-(t - t_0)/w})",
-    source="H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids, 2nd ed., section 3.4 (heat that soaks through a"
-    " slab sets in late), with the logistic curve for its shape",
-    excitation="none; a record several times as long as the warm-up",
-    confusable_with=("step_shift", "random_walk"),
-    prepare=_span,
-    guess=_late_guess,
-    basis=_late_basis,
-    report=_late_report,
-    driven=False,
-    sites=("output",),
-    # what rises within a fifth of the record (4.4 widths from a tenth to nine) is a step
-    limits={"share_of_record": (0.05, np.inf)},
-    vanishes_with=(("drift_over_record",),),
-)
-
 _TWO = Effect(
     name="thermal_drift",
     summary="warm-up: slow, exponential-like, no temperature recorded",
@@ -159,13 +117,31 @@ _TWO = Effect(
     source="F. P. Incropera et al., Fundamentals of Heat and Mass Transfer, 6th ed., eq. 5.6 (lumped capacitances)",
     excitation="a record of a time constant or more, from switch-on",
     confusable_with=("creep", "random_walk", "temperature_sensitivity"),
-    prepare=_span,
+    prepare=time_settings,
     guess=_warm_guess,
     basis=_warm_basis,
     report=_warm_report,
     driven=False,
     sites=("output",),
     vanishes_with=(("drift_over_record", "slow_amplitude", "fast_amplitude"),),
+)
+
+
+_LATE = replace(
+    _TWO,
+    summary="warm-up that sets in late: slow, then faster, then settled (logistic)",
+    parts=_late_parts,
+    equation=r"y = x + a / (1 + e^{-(t - t_0)/w})",
+    source="H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids, 2nd ed., section 3.4 (heat that soaks through a"
+    " slab sets in late), with the logistic curve for its shape",
+    excitation="none; a record several times as long as the warm-up",
+    confusable_with=("step_shift", "random_walk"),
+    guess=_late_guess,
+    basis=_late_basis,
+    report=_late_report,
+    # what rises within a fifth of the record (4.4 widths from a tenth to nine) is a step
+    limits={"share_of_record": (0.05, np.inf)},
+    vanishes_with=(("drift_over_record",),),
 )
 
 
