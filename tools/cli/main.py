@@ -2,15 +2,17 @@
 
 A command's modules are imported when it is called, not to print the list: with all of them, physics, kernels and
 statistics included, ``micron --help`` took seconds. What the list says of a command is the first sentence of its own
-help (a test compares them).
+help, read from the source.
 """
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
@@ -27,114 +29,45 @@ class Command(NamedTuple):
     panel: str
     where: str
     """``module:attribute``; the module is imported when the command is called."""
-    line: str
+
+    @property
+    def line(self) -> str:
+        """The first sentence of the command's own help, read from its source without an import."""
+        module, _, attribute = self.where.partition(":")
+        source = Path(__file__).parents[2] / f"{module.replace('.', '/')}.py"
+        helps: dict[str, str] = {}
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
+            match node:
+                case ast.FunctionDef(name=name):
+                    helps[name] = ast.get_docstring(node) or ""
+                case ast.Assign([ast.Name(id=name)], ast.Call(keywords=[ast.keyword("help", ast.Constant(text)), *_])):
+                    helps[name] = str(text)
+        return " ".join(helps[attribute].split("\n\n")[0].split())
 
 
 COMMANDS = {
-    "run": Command(
-        "Run", "tools.cli.run:run", "Run the instrument in closed loop and report what was left of the tremor."
-    ),
-    "bench": Command(
-        "Run", "tools.cli.bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."
-    ),
-    "simulate": Command(
-        "Run",
-        "tools.cli.simulate:simulate_command",
-        "Simulate the closed loop without wires, tens of times faster than real time; the same figures as micron run.",
-    ),
-    "replay": Command(
-        "Run",
-        "tools.cli.replay:replay",
-        "Run the firmware over a recording and compare every estimate and command with the recorded one, bit for bit.",
-    ),
-    "emulate": Command(
-        "Run",
-        "tools.cli.emulate:emulate",
-        "Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.",
-    ),
-    "trust": Command(
-        "Run",
-        "tools.cli.trust:trust",
-        "Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.",
-    ),
-    "doctor": Command(
-        "Look",
-        "tools.cli.doctor:doctor",
-        "Check what this machine offers and what the bench asks for, and say how to get what is missing.",
-    ),
-    "scan": Command(
-        "Look",
-        "tools.cli.diagnose:scan",
-        "List the machine's ports, the I2C addresses that answer and the CAN traffic; exit 4 when a declared I2C "
-        "device is silent.",
-    ),
-    "read": Command(
-        "Look",
-        "tools.cli.read:read",
-        "Take one reading of every sensor whose driver is from an installed package; nothing is armed.",
-    ),
-    "scope": Command(
-        "Look",
-        "tools.cli.diagnose:scope",
-        "Draw the analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.",
-    ),
-    "dump": Command(
-        "Look",
-        "tools.cli.diagnose:dump",
-        "Print CAN frames as they come, decoded where the id is known; nothing is sent.",
-    ),
-    "log": Command(
-        "Look",
-        "tools.cli.diagnose:log",
-        "Print what a running 'micron bench' says, as it says it. Exit 4 when there is none.",
-    ),
-    "latency": Command(
-        "Look",
-        "tools.cli.diagnose:latency",
-        "Measure how late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.",
-    ),
-    "ramp": Command(
-        "Look",
-        "tools.cli.diagnose:ramp",
-        "Step the outputs over their full range and read each step back. Exit 1 when one is off.",
-    ),
-    "capture": Command(
-        "Look",
-        "tools.cli.diagnose:capture",
-        "Record what goes over every bus while the drivers open the bench and scan, or replay such a transcript.",
-    ),
-    "export": Command(
-        "Look",
-        "tools.cli.recordings:export",
-        "Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.",
-    ),
-    "recover": Command(
-        "Look",
-        "tools.cli.recordings:recover",
-        "Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).",
-    ),
-    "calibrate": Command(
-        "Calibrate", "tools.cli.calibrate:calibrate", "Identify sensors and stacks from calibration recordings."
-    ),
-    "imu": Command(
-        "Calibrate",
-        "tools.cli.imu:imu",
-        "Measure offsets, stability, drift, noise and temperature dependence of an inertial sensor, from recordings or "
-        "on a bench.",
-    ),
-    "noise": Command(
-        "Calibrate",
-        "tools.cli.noise:noise",
-        "Compute the overlapping Allan deviation of a recording and fit white noise, flicker, random walk and ramp.",
-    ),
-    "mismatch": Command(
-        "Mismatch",
-        "tools.cli.mismatch:app",
-        "Find where a simulation and a recording differ, and which physics the simulation lacks.",
-    ),
-    "data": Command(
-        "Mismatch", "tools.cli.data:data", "List and fetch public recordings, each with its licence and checksum."
-    ),
+    name: Command(panel, f"tools.cli.{where}")
+    for panel, rows in {
+        "Run": {
+            "run": "run:run",
+            "bench": "bench:bench",
+            "simulate": "simulate:simulate_command",
+            "replay": "replay:replay",
+            "emulate": "emulate:emulate",
+            "trust": "trust:trust",
+        },
+        "Look": {
+            "doctor": "doctor:doctor",
+            "scan": "diagnose:scan",
+            "read": "read:read",
+            **{name: f"diagnose:{name}" for name in ("scope", "dump", "log", "latency", "ramp", "capture")},
+            "export": "recordings:export",
+            "recover": "recordings:recover",
+        },
+        "Calibrate": {"calibrate": "calibrate:calibrate", "imu": "imu:imu", "noise": "noise:noise"},
+        "Mismatch": {"mismatch": "mismatch:app", "data": "data:data"},
+    }.items()
+    for name, where in rows.items()
 }
 RESEARCH = (
     *("hands", "faults", "soak", "endoscope", "reproduce", "placement", "manipulator", "sensing", "tremor"),
@@ -145,7 +78,7 @@ INSIDE: dict[str, dict[str, str]] = {}
 """Commands of research inside a group of the product: group -> name -> where it is."""
 if find_spec("tools.research") is not None:  # a source tree; the wheel does not contain it
     _research = import_module("tools.research.cli.commands")
-    COMMANDS |= {name: Command("Research", *row) for name, row in _research.COMMANDS.items()}
+    COMMANDS |= {name: Command("Research", where) for name, where in _research.COMMANDS.items()}
     INSIDE |= _research.INSIDE
 
 
@@ -217,6 +150,11 @@ class Helpful(TyperGroup):
 class OnDemand(Helpful):
     """Loads a command when it is called; until then it is a line of help."""
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        for name, command in self.commands.items():
+            command.help = command.help or COMMANDS[name].line
+        super().format_help(ctx, formatter)
+
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, line, rest = super().resolve_command(ctx, args)
         return name, line if name is None else load(name), rest
@@ -257,7 +195,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for _name, _command in COMMANDS.items():
-    app.command(_name, help=_command.line, rich_help_panel=_command.panel)(lambda: None)
+    app.command(_name, rich_help_panel=_command.panel)(lambda: None)
 
 
 def main() -> None:
