@@ -11,10 +11,6 @@ from sim_devices.physics.hysteresis import stops
 from sim_devices.physics.statistics import best_starts, thin
 
 
-def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"span": (float(np.ptp(x)) or 1.0,), "rest": (float(x[0]),)}
-
-
 def _parts(settings: Settings) -> Parts:
     span = settings.get("span", (1.0,))[0]
     return Parts(
@@ -54,7 +50,7 @@ BACKLASH = Effect(
     source="M. Nordin, P.-O. Gutman, Automatica 38 (2002) 1633, section 2; play operator as in Kuhnen 2003, eq. 2",
     excitation="reversals with travel of several gaps",
     confusable_with=("hysteresis", "dead_zone", "coulomb_friction", "dead_time"),
-    prepare=_prepare,
+    prepare=lambda x, residual, ctx: {"span": (float(np.ptp(x)) or 1.0,), "rest": (float(x[0]),)},
     guess=_guess,
     basis=_basis,
     report=_report,

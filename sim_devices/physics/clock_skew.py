@@ -40,10 +40,6 @@ def _skew_parts(settings: Settings) -> Parts:
     return Parts((Parameter("skew_ppm", "ppm", -5e4, 5e4, scale=1e6 * dt / span),))
 
 
-def _skew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.0)
-
-
 def _skew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     n = ctx.t.size
     out = ctx.measured
@@ -81,7 +77,7 @@ _SMOOTH_SKEW = Effect(
     confusable_with=("dropped_samples", "dead_time"),
     prepare=time_settings,
     guess=_skew_guess,
-    apply=_skew_apply,
+    apply=lambda x, ctx, q, settings: resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.0),
     report=reports(("skew_ppm", "ppm")),
     sites=("output",),
     vanishes_with=(("skew_ppm", "skew_change_ppm"),),
@@ -89,29 +85,17 @@ _SMOOTH_SKEW = Effect(
 )
 
 
-def _straight_skew_parts(settings: Settings) -> Parts:
-    return Parts((replace(_skew_parts(settings).nonlinear[0], name="apart_ppm"),))
-
-
-def _straight_skew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample_straight(x, 0.0, 1.0 + 1e-6 * q[0], 0.0)
-
-
 _STRAIGHT_SKEW = replace(
     _SMOOTH_SKEW,
-    parts=_straight_skew_parts,
+    parts=lambda settings: Parts((replace(_skew_parts(settings).nonlinear[0], name="apart_ppm"),)),
     equation=r"y(t) = x\left((1 + \epsilon)\,t\right),\; x \text{ straight between samples}",
-    apply=_straight_skew_apply,
+    apply=lambda x, ctx, q, settings: resample_straight(x, 0.0, 1.0 + 1e-6 * q[0], 0.0),
 )
 
 
 def _drifting_parts(settings: Settings) -> Parts:
     skew = _skew_parts(settings).nonlinear[0]
     return Parts((replace(skew, name="skew_at_begin_ppm"), replace(skew, name="skew_change_ppm")))
-
-
-def _drifting_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.5e-6 * q[1] / ctx.t.size)
 
 
 def _drifting_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -137,7 +121,7 @@ _DRIFTING = replace(
     equation=r"y(t) = x\left(t + \epsilon t + \alpha t^2 / 2T\right)",
     source="D. W. Allan, IEEE Trans. UFFC 34 (1987) 647 (time error y t + D t^2/2); Keys 1981 for the resampling",
     guess=_drifting_guess,
-    apply=_drifting_apply,
+    apply=lambda x, ctx, q, settings: resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.5e-6 * q[1] / ctx.t.size),
     report=_drifting_report,
 )
 CLOCK_SKEW = replace(_SMOOTH_SKEW, variants=(_STRAIGHT_SKEW, _DRIFTING))

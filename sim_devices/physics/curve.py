@@ -110,10 +110,6 @@ def _fold_parts(settings: Settings) -> Parts:
     return Parts((Parameter("power", "1", 0.5, 3.0, scale=0.2), Parameter("zero", "{out}", scale=0.05 * size)))
 
 
-def _fold_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    return tuple((power, 0.0) for power in (1.0, 1.5, 2.0))
-
-
 def _fold_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     size = settings["size"][0]
     # an offset of the twin is one of what is folded
@@ -145,7 +141,7 @@ _FOLD = replace(
     source="T. Wigren, M. Schoukens, Coupled Electric Drives Data Set and Reference Models, Uppsala 2017-024",
     excitation="both signs of the signal",
     prepare=_fold_settings,
-    guess=_fold_guess,
+    guess=lambda x, residual, ctx, settings: tuple((power, 0.0) for power in (1.0, 1.5, 2.0)),
     basis=None,
     apply=_fold_apply,
     report=reports(("power", "1"), ("zero", "{out}")),

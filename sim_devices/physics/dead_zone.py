@@ -22,10 +22,6 @@ def _dead_parts(settings: Settings) -> Parts:
     )
 
 
-def _dead_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return -np.clip(x - q[1], -q[0], q[0])[:, None]
-
-
 def _dead_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     lo, hi = settings["range"]
     span = hi - lo
@@ -58,7 +54,7 @@ DEAD_ZONE = Effect(
     confusable_with=("static_nonlinearity", "backlash", "coulomb_friction"),
     prepare=lambda x, residual, ctx: {"range": value_range(x)},
     guess=_dead_guess,
-    basis=_dead_basis,
+    basis=lambda x, ctx, q, settings: -np.clip(x - q[1], -q[0], q[0])[:, None],
     report=_dead_report,
     # a slope gained inside makes a limit of it; one that is lost whole scatters about 1
     limits={"slope_lost_inside": (0.0, 1.1)},

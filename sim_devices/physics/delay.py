@@ -16,10 +16,6 @@ def _delay_parts(settings: Settings) -> Parts:
     return Parts((Parameter("delay_s", "s", -2 * dt, max(20 * dt, min(0.2 * span, 5.0)), scale=dt),))
 
 
-def _delay_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample(x, -q[0] / ctx.dt, 1.0, 0.0)
-
-
 def _straight_delay_parts(settings: Settings) -> Parts:
     # a name of its own: twin files tell forms by their parameters
     return Parts((replace(_delay_parts(settings).nonlinear[0], name="late_s"),))
@@ -55,7 +51,7 @@ _SMOOTH_DELAY = Effect(
     confusable_with=("first_order_lag", "channel_delay", "clock_skew"),
     prepare=time_settings,
     guess=_delay_guess,
-    apply=_delay_apply,
+    apply=lambda x, ctx, q, settings: resample(x, -q[0] / ctx.dt, 1.0, 0.0),
     report=reports(("delay_s", "s")),
     vanishes_with=(("delay_s",),),
     essential=("delay_s",),

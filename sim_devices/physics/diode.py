@@ -70,10 +70,6 @@ def _parts(settings: Settings) -> Parts:
     )
 
 
-def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return conducted(x, float(q[0]), float(q[1]), _side(settings))
-
-
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     lo, hi = settings["range"]
     return _ranked(x, residual, ctx, lo, hi, _side(settings))[:3]
@@ -99,7 +95,7 @@ ONE_SIDED_CONDUCTION = Effect(
     confusable_with=("saturation", "static_nonlinearity", "dead_zone"),
     prepare=_prepare,
     guess=_guess,
-    apply=_apply,
+    apply=lambda x, ctx, q, settings: conducted(x, float(q[0]), float(q[1]), _side(settings)),
     report=_report,
     # at either end it would stand in for saturation in anything that is no circuit, and neither would be named
     sites=("between",),

@@ -80,10 +80,6 @@ def _walk_parts(settings: Settings) -> Parts:
     return Parts((), tuple(Parameter(f"level{i + 1}", "{out}") for i in range(n)), 8.0 * np.diff(np.eye(n), axis=0))
 
 
-def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return hats(ctx.t, np.array(settings.get("knots_s", (0.0, 1.0))))
-
-
 def growth(residual: Array, keep: np.ndarray, short: int = 64, long: int = 16) -> float:
     """Return the growth of the mean square difference of adjacent block means from short blocks to long ones.
 
@@ -277,7 +273,7 @@ RANDOM_WALK = Effect(
     excitation="a long record",
     confusable_with=("thermal_drift", "step_shift", "temperature_sensitivity"),
     prepare=_walk_prepare,
-    basis=_walk_basis,
+    basis=lambda x, ctx, q, settings: hats(ctx.t, np.array(settings.get("knots_s", (0.0, 1.0)))),
     test=_walk_test,
     report=_walk_report,
     driven=False,

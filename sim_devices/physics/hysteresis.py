@@ -463,10 +463,6 @@ def _force_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return -stops(x, np.array(settings.get("thresholds", (1.0,))), float(x[0]), np.array(ctx.starts, np.int64))
 
 
-def _force_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    return {"thresholds": np.array(settings["thresholds"]), "memory": np.asarray(w)}
-
-
 def _force_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
     level = float(p @ np.array(settings["thresholds"])) / g
@@ -487,7 +483,7 @@ _FORCE = Effect(
     excitation="reversals of motion at several amplitudes",
     prepare=_force_prepare,
     basis=_force_basis,
-    fill=_force_fill,
+    fill=lambda q, w, settings: {"thresholds": np.array(settings["thresholds"]), "memory": np.asarray(w)},
     report=_force_report,
     vanishes_with=(("force_loop_half_height",),),
 )

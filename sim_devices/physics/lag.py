@@ -40,10 +40,6 @@ def _parts(settings: Settings) -> Parts:
     return Parts((Parameter("time_constant_s", "s", 0.02 * dt, 0.5 * span, log=True, scale=dt),))
 
 
-def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return low_pass(x, ctx.dt, q[0], np.array(ctx.starts))
-
-
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
     model, at = ctx.to_output(x), np.zeros(1, np.int64)
@@ -68,7 +64,7 @@ FIRST_ORDER_LAG = Effect(
     confusable_with=("dead_time", "resonance", "creep", "slew_limit"),
     prepare=time_settings,
     guess=_guess,
-    apply=_apply,
+    apply=lambda x, ctx, q, settings: low_pass(x, ctx.dt, q[0], np.array(ctx.starts)),
     report=_report,
     vanishes_with=(("time_constant_s",),),
     essential=("time_constant_s",),

@@ -21,10 +21,6 @@ def _parts(settings: Settings) -> Parts:
     return Parts((), (Parameter("per_unit", "1/{out}", scale=0.1 / spread),))
 
 
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return (x - settings["centre"][0])[:, None]
-
-
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (
         Human("relative_change", float(p[0]), "1/{out}"),
@@ -43,7 +39,7 @@ PARAMETER_VARIATION = Effect(
     excitation="a signal that changes while the input keeps moving",
     confusable_with=("thermal_drift", "temperature_sensitivity"),
     prepare=_settings,
-    basis=_basis,
+    basis=lambda x, ctx, q, settings: (x - settings["centre"][0])[:, None],
     fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], settings["centre"][0], 0.0])},
     report=_report,
     acts_on=("parameter",),

@@ -81,10 +81,6 @@ def _parts(settings: Settings) -> Parts:
     )
 
 
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return _columns(x, ctx.dt, q[0], settings, ctx.starts)
-
-
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
     usual = settings["usual_slope"][0]
@@ -123,7 +119,7 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     confusable_with=("hysteresis", "first_order_lag", "creep", "resonance"),
     prepare=_prepare,
     guess=_guess,
-    basis=_basis,
+    basis=lambda x, ctx, q, settings: _columns(x, ctx.dt, q[0], settings, ctx.starts),
     report=_report,
     # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it
     limits={"change_with_speed": (0.08, np.inf)},

@@ -30,10 +30,6 @@ def limit(x, lo, hi, soft):
     return y
 
 
-def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"range": (float(x.min()), float(x.max()))}
-
-
 def _parts(settings: Settings) -> Parts:
     lo, hi = settings.get("range", (-1.0, 1.0))
     span = hi - lo or 1.0
@@ -44,10 +40,6 @@ def _parts(settings: Settings) -> Parts:
             Parameter("corner", "{in}", 1e-4 * span, 0.5 * span, log=True, scale=0.05 * span),
         )
     )
-
-
-def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return limit(x, min(q[0], q[1]), max(q[0], q[1]), q[2])
 
 
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -82,8 +74,8 @@ SATURATION = Effect(
     source="H. K. Khalil, Nonlinear Systems, 3rd ed., section 1.2.7; corners by the softplus function",
     excitation="amplitudes that reach the limits, and smaller ones for comparison",
     confusable_with=("static_nonlinearity", "slew_limit"),
-    prepare=_prepare,
+    prepare=lambda x, residual, ctx: {"range": (float(x.min()), float(x.max()))},
     guess=_guess,
-    apply=_apply,
+    apply=lambda x, ctx, q, settings: limit(x, min(q[0], q[1]), max(q[0], q[1]), q[2]),
     report=reports(("lower_limit", "{in}"), ("upper_limit", "{in}"), ("corner", "{in}")),
 )

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from sim_devices.physics.effect import Array, Effect, Human, Parameter, Parts, Settings, reports
-
-
-def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("gain", 1.0 + float(p[0]), "1"), Human("gain_error", float(p[0]), "1"))
-
+from sim_devices.physics.effect import Effect, Human, Parameter, Parts, reports
 
 SCALE_ERROR = Effect(
     name="scale_error",
@@ -24,7 +17,7 @@ SCALE_ERROR = Effect(
     excitation="amplitudes at which the simulation is not linear, or a gain that is known in the simulation",
     confusable_with=("static_nonlinearity", "saturation"),
     basis=lambda x, ctx, q, settings: x[:, None],
-    report=_report,
+    report=lambda p, settings, scale: (Human("gain", 1.0 + float(p[0]), "1"), Human("gain_error", float(p[0]), "1")),
     vanishes_with=(("gain_error",),),
     proportional=True,
     shifts_line=True,

@@ -114,10 +114,6 @@ def _both_ways(q: Array) -> Array:
     return np.array([q[0], q[0], q[1]])
 
 
-def _even_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return _slew_apply(x, ctx, _both_ways(q), settings)
-
-
 def _even_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     return [(up, lag) for up, _, lag in _slew_guess(x, residual, ctx, settings)]
 
@@ -153,7 +149,7 @@ SLEW_LIMIT = replace(
     parts=_even_parts,
     equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r,\, r\right)",
     guess=_even_guess,
-    apply=_even_apply,
+    apply=lambda x, ctx, q, settings: _slew_apply(x, ctx, _both_ways(q), settings),
     report=_even_report,
     variants=(_UNEVEN_SLEW, _ROUNDED_SLEW),
 )

@@ -117,10 +117,6 @@ Expression = Callable[[Slot, str, str], str]
 """(slot, signal, driver) -> code of the changed signal."""
 
 
-def _lag(s: Slot, x: str, d: str) -> str:
-    return f"{s.part('low_pass', s.at('time_constant_s') + ', dt')}({x})"
-
-
 def _ac(s: Slot, x: str, d: str) -> str:
     if "period_by_2pi_s" in s.values:
         period, damping = s.at("period_by_2pi_s"), s.at("damping_ratio")
@@ -171,10 +167,6 @@ def _saturation(s: Slot, x: str, d: str) -> str:
 def _conduction(s: Slot, x: str, d: str) -> str:
     s.writer.used.add("conducted")
     return f"conducted({x}, {s.at('knee')}, {s.at('width')}, {numbers(s.setting('side'))})"
-
-
-def _scale(s: Slot, x: str, d: str) -> str:
-    return f"(1 + {s.at('gain_error')}) * ({x})"
 
 
 def _zero(s: Slot, x: str, d: str) -> str:
@@ -232,10 +224,6 @@ def _elements(s: Slot, d: str) -> str:
             return f"curved({plain()}, {d}, {numbers(bent.weights)}, {ends}, {hysteresis.CURVES + 1})"
         case _:
             return element("relays", f"{numbers(lo)}, {numbers(hi)}, {hysteresis.N_GRID}")
-
-
-def _hysteresis(s: Slot, x: str, d: str) -> str:
-    return f"{x} + {_elements(s, d)} @ {s.group('w')}"
 
 
 def _rate_hysteresis(s: Slot, x: str, d: str) -> str:
@@ -394,7 +382,7 @@ def _elsewhere(s: Slot, x: str, d: str) -> str:
 
 
 EXPRESSIONS: Mapping[str, Expression] = {
-    "hysteresis": _hysteresis,
+    "hysteresis": lambda s, x, d: f"{x} + {_elements(s, d)} @ {s.group('w')}",
     "rate_dependent_hysteresis": _rate_hysteresis,
     "creep": _creep,
     "backlash": _backlash,
@@ -403,7 +391,7 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "static_nonlinearity": _curve,
     "one_sided_conduction": _conduction,
     "slew_limit": _slew,
-    "first_order_lag": _lag,
+    "first_order_lag": lambda s, x, d: f"{s.part('low_pass', s.at('time_constant_s') + ', dt')}({x})",
     "ac_coupling": _ac,
     "resonance": _resonance,
     "dead_time": _delay,
@@ -423,7 +411,7 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "sensor_position_error": _elsewhere,
     "channel_delay": _delay,
     "constant_load": _zero,
-    "scale_error": _scale,
+    "scale_error": lambda s, x, d: f"(1 + {s.at('gain_error')}) * ({x})",
     "zero_error": _zero,
 }
 """Writers of the effects of a signal path. ``FORCES`` has those of forces inside an equation of motion."""
@@ -476,14 +464,6 @@ def _spring(s: Slot) -> ForceCode:
     return ForceCode("".join(f" - {s.at(n)} * {powers[n]}" for n in s.values))
 
 
-def _drag(s: Slot) -> ForceCode:
-    return ForceCode(f" - {s.at('drag')} * abs(v) * v")
-
-
-def _amplitude_damping(s: Slot) -> ForceCode:
-    return ForceCode(f" - {s.at('growth')} * x**2 * v")
-
-
 def _clearance(s: Slot) -> ForceCode:
     inside = f"np.clip(x - {s.at('centre')}, -{s.at('half_gap')}, {s.at('half_gap')})"
     if "joint" in s.placed.effect.acts_on:
@@ -494,14 +474,6 @@ def _clearance(s: Slot) -> ForceCode:
 def _cogging(s: Slot) -> ForceCode:
     waves = [(f"{w}{h}", f"np.{w}({2 * h} * np.pi * x / {s.at('period')})") for h in (1, 2) for w in ("sin", "cos")]
     return ForceCode("".join(f" + {s.at(n)} * {wave}" for n, wave in waves))
-
-
-def _lever(s: Slot) -> ForceCode:
-    return ForceCode(f" + {s.at('sine')} * np.sin(x) + {s.at('cosine')} * np.cos(x)")
-
-
-def _load(s: Slot) -> ForceCode:
-    return ForceCode(f" + {s.at('load')}")
 
 
 def _force_memory(s: Slot) -> ForceCode:
@@ -516,11 +488,11 @@ FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
     "stribeck_friction": _friction,
     "cubic_stiffness": _spring,
     "cogging": _cogging,
-    "gravity_load": _lever,
-    "quadratic_drag": _drag,
-    "amplitude_dependent_damping": _amplitude_damping,
+    "gravity_load": lambda s: ForceCode(f" + {s.at('sine')} * np.sin(x) + {s.at('cosine')} * np.cos(x)"),
+    "quadratic_drag": lambda s: ForceCode(f" - {s.at('drag')} * abs(v) * v"),
+    "amplitude_dependent_damping": lambda s: ForceCode(f" - {s.at('growth')} * x**2 * v"),
     "clearance": _clearance,
-    "constant_load": _load,
+    "constant_load": lambda s: ForceCode(f" + {s.at('load')}"),
 }
 
 
