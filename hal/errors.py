@@ -39,6 +39,10 @@ class HalError(Exception):
 
     default_kind = ErrorKind.BUS
 
+    def __init_subclass__(cls, *, kind: ErrorKind | None = None) -> None:
+        super().__init_subclass__()
+        cls.default_kind = kind or cls.default_kind
+
     def __init__(
         self,
         message: str,
@@ -62,78 +66,56 @@ def name_device(error: HalError, name: str) -> HalError:
     return error
 
 
-class BenchError(HalError):
+class BenchError(HalError, kind=ErrorKind.CONFIG):
     """The bench description or a configuration is wrong (exit status 2)."""
 
-    default_kind = ErrorKind.CONFIG
 
-
-class DeviceNotFound(HalError):
+class DeviceNotFound(HalError, kind=ErrorKind.NOT_FOUND):
     """A declared device or port is not there (exit status 4)."""
-
-    default_kind = ErrorKind.NOT_FOUND
 
 
 class BusError(HalError):
     """A transfer failed on the wire."""
 
 
-class I2cNack(BusError):
+class I2cNack(BusError, kind=ErrorKind.NACK_ADDRESS):
     """Is raised when no device acknowledges the address, or the device refuses a data byte."""
 
-    default_kind = ErrorKind.NACK_ADDRESS
 
-
-class HalTimeout(HalError):
+class HalTimeout(HalError, kind=ErrorKind.TIMEOUT):
     """A bounded wait ended without an answer."""
 
-    default_kind = ErrorKind.TIMEOUT
 
-
-class Overrun(HalError):
+class Overrun(HalError, kind=ErrorKind.OVERRUN):
     """Is raised when a buffer overflowed. ``lost`` is the number of lost samples, as far as it is known."""
 
-    default_kind = ErrorKind.OVERRUN
 
-
-class Disconnected(HalError):
+class Disconnected(HalError, kind=ErrorKind.DISCONNECTED):
     """Is raised when the port or its peer is gone."""
 
-    default_kind = ErrorKind.DISCONNECTED
 
-
-class ProtocolError(HalError):
+class ProtocolError(HalError, kind=ErrorKind.PROTOCOL):
     """The device answered something its manual does not allow."""
 
-    default_kind = ErrorKind.PROTOCOL
 
-
-class WrongDevice(HalError):
+class WrongDevice(HalError, kind=ErrorKind.IDENTITY):
     """The identity check failed."""
 
-    default_kind = ErrorKind.IDENTITY
 
-
-class SafetyTrip(HalError):
+class SafetyTrip(HalError, kind=ErrorKind.SAFETY):
     """An output was refused or driven to its safe state."""
-
-    default_kind = ErrorKind.SAFETY
 
 
 class LeaseLost(SafetyTrip):
     """A command came too late: a guardian has the outputs, or will have them."""
 
 
-class Closed(HalError):
+class Closed(HalError, kind=ErrorKind.CLOSED):
     """Used after ``close()``."""
 
-    default_kind = ErrorKind.CLOSED
 
-
-class OpenFailed(HalError):
+class OpenFailed(HalError, kind=ErrorKind.NOT_FOUND):
     """Several devices failed to open: one tree, every cause."""
-
-    default_kind = ErrorKind.NOT_FOUND
 
     def __init__(self, errors: Sequence[HalError]) -> None:
         lines = "\n".join(f"  - {e}" for e in errors)

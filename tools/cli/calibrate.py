@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+from math import degrees
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
-from tools.cli.calibrate_actuation import Out
-from tools.cli.calibrate_axes import Gravity, Model, OnDrift
-from tools.cli.common import JsonOption, clear_errors, console
-from tools.output import check_writable, write_calibration, write_json
+from hal.types import STANDARD_GRAVITY
+from tools.cli import calibrate_axes
+from tools.cli.bench_option import bench_path
+from tools.cli.calibrate_actuation import Out, manipulator, piezo
+from tools.cli.calibrate_axes import Columns, Gravity, Model, OnDrift, Rate, Result, three
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.output import check_writable, write_json
 from tools.terminal import table_of
 
 calibrate = typer.Typer(help="Identify sensors and stacks from calibration recordings.")
 
-calibrate.command("accelerometer")(calibrate_axes.accelerometer)
-calibrate.command("magnetometer")(calibrate_axes.magnetometer)
-calibrate.command("gyroscope")(calibrate_gyroscope.gyroscope)
-calibrate.command("positions")(calibrate_positions.positions)
-calibrate.command("piezo")(calibrate_actuation.piezo)
-calibrate.command("manipulator")(calibrate_actuation.manipulator)
 
-
-@calibrate.command("sensors")
 def sensors(
     recording: Annotated[
         Path, typer.Argument(metavar="TUMBLE", help="Recording of the resting instrument on two rotary stages.")
@@ -43,16 +38,14 @@ def sensors(
 
     Example: micron calibrate sensors out/tumble --out out/sensors.toml
     """
-    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.calibration_file import save_calibration
     from tools.calibrate.tumble import SENSORS, identify, load_tumble
 
     with clear_errors():
         check_writable(json_file, out)
         result = identify(load_tumble(recording), quadratic=model is Model.COMPOSITE, fit_drift=drift is OnDrift.FIT)
         made_by = f"micron calibrate sensors {recording}"
-        write_calibration(
-            out, calibration_toml("sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
-        )
+        save_calibration(out, "sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
         table = table_of(
             f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %; bias with in-plane "
             "and out-of-plane force in mg/g^2; rms of the line, of the model and of poses left out in mV",
@@ -82,3 +75,120 @@ def sensors(
         console().print("missing poses: " + (", ".join(result.accelerometers.missing) or "none"))
         console().print(f"written: {out}")
         write_json({"format": 1, "out": str(out), **result.as_dict()}, json_file)
+
+
+def gyroscope(
+    *,
+    recording: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Still poses with hand turns between: both sensors' columns.")
+    ],
+    columns: Columns = "gyro_x_raw,gyro_y_raw,gyro_z_raw",
+    accelerometer_columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
+    gravity: Gravity = STANDARD_GRAVITY,
+    rate_hz: Rate = None,
+    shortest_s: Annotated[float, typer.Option(min=0.05, help="Shortest rest that is a pose.")] = 0.5,
+    out: Result = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Fit scale, misalignment and bias of a gyroscope from still poses and the turns between them (Tedaldi).
+
+    Example: micron calibrate gyroscope log.npz --gravity 9.81744
+    """
+    from dataclasses import asdict
+
+    from tools.calibrate.calibration_file import save_calibration
+    from tools.calibrate.gyroscope import fit_gyroscope
+    from tools.calibrate.logs import load_log
+
+    with clear_errors():
+        check_writable(json_file, out)
+        log = load_log(recording, rate_hz)
+        force, rate = log.matrix(three(accelerometer_columns)), log.matrix(three(columns))
+        result = fit_gyroscope(force, rate, log.need_rate(), gravity, shortest_s)
+        calibrate_axes.print_parameters(
+            "gyroscope (rad/s per count, counts, rad)",
+            result.parameters,
+            [
+                f"{result.turns} turns between {result.accelerometer.poses} poses, {result.saturated} left out because "
+                f"the gyroscope saturates; gravity after a turn off by {degrees(result.residual_rad):.2f} deg rms, "
+                f"condition {result.condition:.1f}",
+                "missing poses: " + (", ".join(result.accelerometer.missing) or "none"),
+            ],
+            json_file,
+        )
+        values = {name: e.value for name, e in result.parameters.items()}
+        save_calibration(out, "gyroscope", f"micron calibrate gyroscope {recording}", {"gyroscope": values})
+        write_json({"format": 1, **asdict(result)}, json_file)
+
+
+def positions(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDING", help="Recording of the instrument swung about its tip in a dimple for a minute."
+        ),
+    ],
+    bench: Annotated[
+        Path, typer.Option(metavar="FILE|NAME", help="Bench of the instrument; all but the positions is calibrated.")
+    ],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Calibration file for the bench.")] = None,
+    rate_hz: Rate = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Find the positions of the accelerometers with 95 % intervals; name the file under [firmware] calibration of the
+    bench.
+
+    Put the tip into a dimple, switch the manipulator to neutral, swing the handle by 20 degrees and more about all
+    axes, slowly and at 1 to 2 Hz mixed, for a minute.
+
+    A recording to try: python -m sim_devices.plant.lab pivot --bench benches/micron.toml --out out/pivot
+
+    Example: micron calibrate positions out/pivot --bench micron --out out/positions.toml
+    """
+    from tools.calibrate.calibration_file import save_calibration
+    from tools.calibrate.instrument_log import bench_sensing, instrument_readings
+    from tools.calibrate.logs import load_log
+    from tools.calibrate.positions import fit_positions
+
+    with clear_errors():
+        check_writable(json_file, out)
+        config = bench_sensing(bench_path(bench))
+        log = load_log(recording, rate_hz)
+        readings, field = instrument_readings(log, config)
+        with console().status("fitting the swing"):
+            fit = fit_positions(readings, field, log.need_rate(), config)
+        table = table_of(
+            f"{fit.seconds:.0f} s, {fit.turning_rad_s:.2f} rad/s rms, condition {fit.condition:.0f}, residual "
+            f"{1e3 * fit.residual_m_s2:.2f} mm/s^2; intervals of 95 %",
+            "place", "axis", "believed (mm)", "found (mm)", "moved by (mm)", left=2,
+        )  # fmt: skip
+        for name, before, place, reach in zip(fit.names, fit.believed, fit.places, fit.reach, strict=True):
+            for axis, was, value, half in zip("xyz", 1e3 * before, 1e3 * place, 1e3 * reach, strict=True):
+                named = name if axis == "x" else ""
+                table.add_row(named, axis, f"{was:.2f}", f"{value:.3f} +- {half:.3f}", f"{value - was:+.3f}")
+        data_console().print(table)
+        made_by = f"micron calibrate positions {recording} --bench {bench}"
+        save_calibration(out, "sensor positions", made_by, {"sensing": {"positions_m": fit.places.tolist()}})
+        if out is not None:
+            console().print(f"written: {out}")
+        write_json(
+            {
+                "format": 1,
+                "positions_m": fit.places,
+                "believed_m": fit.believed,
+                "parameters": {
+                    name: {"value": e.value, "low": e.low, "high": e.high} for name, e in fit.parameters.items()
+                },
+                "residual_m_s2": fit.residual_m_s2,
+                "condition": fit.condition,
+                "seconds": fit.seconds,
+                "turning_rad_s": fit.turning_rad_s,
+            },
+            json_file,
+        )
+
+
+for _command in (calibrate_axes.accelerometer, calibrate_axes.magnetometer, gyroscope, positions):
+    calibrate.command()(_command)
+for _command in (piezo, manipulator, sensors):
+    calibrate.command()(_command)

@@ -12,7 +12,7 @@ import typer
 from hal.types import STANDARD_GRAVITY
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_calibration, write_json
+from tools.output import check_writable, write_json
 from tools.terminal import table_of
 
 
@@ -98,7 +98,7 @@ def accelerometer(
 
     Quick: micron calibrate accelerometer flat.csv --method flat --up z --counts-per-g 16384
     """
-    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.calibration_file import save_calibration
     from tools.calibrate.logs import load_log
     from tools.calibrate.multi_position import MultiPosition, identify_poses
     from tools.calibrate.quick import flat, free_fall, turn
@@ -131,14 +131,8 @@ def accelerometer(
             notes += result.lines()
         notes.append("missing: " + (", ".join(result.missing) or "nothing"))
         print_parameters(f"accelerometer, {method.value}", result.parameters, notes, json_file)
-        if out is not None:
-            values = {name: e.value for name, e in result.parameters.items()}
-            write_calibration(
-                out,
-                calibration_toml(
-                    "accelerometer", f"micron calibrate accelerometer {recording}", {"accelerometer": values}
-                ),
-            )
+        values = {name: e.value for name, e in result.parameters.items()}
+        save_calibration(out, "accelerometer", f"micron calibrate accelerometer {recording}", {"accelerometer": values})
         write_json({"format": 1, "method": method.value, **asdict(result), "warm_up": asdict(warm)}, json_file)
 
 
@@ -154,7 +148,7 @@ def _stage(
 ) -> None:
     """Calibrate three axes whose attitude two stages gave: x and y of one package, z of another (Ang 2004 sec.
     3.2.1.7)."""
-    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.calibration_file import save_calibration
     from tools.calibrate.composite import fit_composite
     from tools.calibrate.stage_log import load_stage_log
     from tools.calibrate.tumble import refuse_drift
@@ -179,10 +173,8 @@ def _stage(
     notes.append("missing: " + (", ".join(fit.missing) or "nothing"))
     named = {f"{n}.{k}": e for n, axis in zip("xyz", fit.axes, strict=True) for k, e in axis.parameters.items()}
     print_parameters(f"accelerometer, stage, {fit.poses} poses", named, notes, json_file)
-    if out is not None:
-        tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
-        made_by = f"micron calibrate accelerometer {recording} --method stage"
-        write_calibration(out, calibration_toml("accelerometer", made_by, tables))
+    tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
+    save_calibration(out, "accelerometer", f"micron calibrate accelerometer {recording} --method stage", tables)
     write_json({"format": 1, "method": "stage", **asdict(fit)}, json_file)
 
 
@@ -205,7 +197,7 @@ def magnetometer(
 
     With all: micron calibrate magnetometer log.npz --accelerometer-columns ax,ay,az --reset-columns rx,ry,rz
     """
-    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.calibration_file import save_calibration
     from tools.calibrate.ellipsoid import fit_ellipsoid
     from tools.calibrate.field_axes import fit_turn, strap
     from tools.calibrate.logs import load_log
@@ -237,12 +229,10 @@ def magnetometer(
         else:
             notes.append("the turn between magnetometer and body is not in these data: give --accelerometer-columns")
         print_parameters("magnetometer", parameters, notes, json_file)
-        if out is not None:
-            table = {"matrix": matrix.tolist(), "bias": result.bias.tolist()}
-            if offset is not None:
-                table["bridge_offset"] = [e.value for e in offset]
-            made_by = f"micron calibrate magnetometer {recording}"
-            write_calibration(out, calibration_toml("magnetometer", made_by, {"magnetometer": table}))
+        table = {"matrix": matrix.tolist(), "bias": result.bias.tolist()}
+        if offset is not None:
+            table["bridge_offset"] = [e.value for e in offset]
+        save_calibration(out, "magnetometer", f"micron calibrate magnetometer {recording}", {"magnetometer": table})
         body = None if turn is None else asdict(turn)
         write_json(
             {"format": 1, **asdict(result), "bridge_offset": offset and [asdict(e) for e in offset], "body": body},
