@@ -88,7 +88,6 @@ class LiveWatch:
         self._recent: Array = np.zeros((0, len(twin.outputs)))
         self._last_s = float("nan")
         self._first_s = float("nan")
-        self._residual_s = 0.0
         self._alarms: list[Alarm] = []
         self._counts: dict[str, int] = {}
         self._gaps, self._cpu_s, self._why = 0, 0.0, ""
