@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,7 +223,8 @@ def likeliest(law: Law, least: float, learned: NDArray[np.bool_], decades: Seque
 
     best = decades[int(np.argmin([badness(v) for v in decades]))]
     wide = 0.5 * (decades[1] - decades[0])
-    found = minimize_scalar(badness, bounds=(best - wide, best + wide), method="bounded", options={"xatol": 0.02})
+    options = {"xatol": 0.02}
+    found: Any = minimize_scalar(badness, bounds=(best - wide, best + wide), method="bounded", options=options)
     return 10.0 ** float(found.x), float(found.fun)
 
 
