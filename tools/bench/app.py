@@ -17,6 +17,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from firmware_py.frame import Layout
+from hal.bench import load_bench
+from tools.bench.firmware import Choice, why_not_compiled
 from tools.bench.guard import Access, Guard
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
@@ -44,6 +46,31 @@ def catalogue(layout: Layout) -> list[dict[str, Any]]:
     ]
 
 
+def known_bench(session: Session, name: str) -> Path:
+    """Return the bench file called ``name``, which lies beside the one that was given; the present one for an empty
+    name. Raises ``InputError``."""
+    if name and Path(name) not in session.home.glob("*.toml"):
+        raise InputError(f"{name} is not one of the benches in {session.home}")
+    return Path(name) if name else session.choice.bench
+
+
+def read_choice(session: Session, table: dict[str, Any]) -> Choice:
+    """Return the choice of the next run from the request to start it. Raises ``InputError``.
+
+    Without ``compiled`` the loop of the present bench stays what it is, and another bench runs in Python.
+    """
+    bench = known_bench(session, text(table, "bench"))
+    is_same = bench == session.choice.bench
+    flags = {"sense_only": False, "compiled": session.choice.compiled and is_same}
+    for key in flags:
+        flags[key] = table.get(key, flags[key])
+        if not isinstance(flags[key], bool):
+            raise InputError(f"{key} must be true or false")
+    if table.get("compiled") and flags["sense_only"]:
+        raise InputError("a compiled run moves outputs, and one that senses only moves none; choose one of them")
+    return replace(session.choice, bench=bench, **flags)
+
+
 def core_routes(session: Session, access: Access) -> list[BaseRoute]:
     """Return the routes of page, websocket, firmware and recordings."""
     viewers: set[Viewer] = set()
@@ -57,19 +84,17 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
     async def benches(_: Request) -> Any:
         return {"benches": sorted(str(p) for p in session.home.glob("*.toml")), "now": str(session.choice.bench)}
 
+    async def compiled(request: Request) -> Any:
+        """Say why a bench cannot run compiled; the present one where the request names none."""
+        bench = known_bench(session, request.query_params.get("bench", ""))
+        return {"why": await asyncio.to_thread(lambda: why_not_compiled(load_bench(bench)))}
+
     async def safe(_: Request) -> Any:
         return {"ok": session.order("safe")}
 
     async def start(request: Request) -> Any:
         table = await body(request)
-        bench = text(table, "bench")
-        if bench and Path(bench) not in session.home.glob("*.toml"):
-            raise InputError(f"{bench} is not one of the benches in {session.home}")
-        sense_only = table.get("sense_only", False)
-        if not isinstance(sense_only, bool):
-            raise InputError("sense_only must be true or false")
-        choice = replace(session.choice, sense_only=sense_only)
-        await session.start(replace(choice, bench=Path(bench)) if bench else choice)
+        await session.start(read_choice(session, table))
 
     async def stop(_: Request) -> Any:
         await session.stop()
@@ -90,6 +115,7 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
         Route("/", page),
         Route("/api/channels", clear(channels)),
         Route("/api/benches", clear(benches)),
+        Route("/api/benches/compiled", clear(compiled)),
         Route("/api/safe", clear(safe), methods=["POST"]),
         Route("/api/firmware/start", clear(start), methods=["POST"]),
         Route("/api/firmware/stop", clear(stop), methods=["POST"]),

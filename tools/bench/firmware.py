@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from firmware_py.compiled.eligible import check_compiled
 from firmware_py.live.memory import LiveMemory
 from firmware_py.run_request import RunRequest
+from hal.bench import BenchFile
 from hal.children import child_command, child_environment
 from hal.clock import Pace
+from hal.errors import HalError
 
 FOREVER_S = 30 * 86_400.0
 TRUTH_S = 5.0
@@ -26,7 +29,8 @@ STOP_S = 15.0
 
 @dataclass(frozen=True)
 class Choice:
-    """Holds the choices of a run."""
+    """Holds the choices of a run. ``pace`` is that of runs in Python, ``compiled`` that of the page: a run that arms
+    nothing is Python all the same."""
 
     bench: Path
     hand_file: str | None = None
@@ -35,6 +39,31 @@ class Choice:
     stale_ms: float | None = None
     sense_only: bool = False
     pace: Pace | None = None
+    compiled: bool = False
+
+    @property
+    def runs_compiled(self) -> bool:
+        """Return whether the ticks run in one compiled thread."""
+        return self.compiled and not self.sense_only
+
+    @property
+    def run_pace(self) -> Pace | None:
+        """Return the pace of the run: emulated time passes in Python, so a compiled run is on the wall clock."""
+        return "realtime" if self.runs_compiled else self.pace
+
+    def check(self, bench: BenchFile) -> None:
+        """Raise ``HalError`` if a compiled run is chosen and ``bench`` cannot be run compiled."""
+        if self.runs_compiled:
+            check_compiled(bench, "realtime")
+
+
+def why_not_compiled(bench: BenchFile) -> str:
+    """Return the message that refuses a compiled run of ``bench``; an empty text if it can be run compiled."""
+    try:
+        check_compiled(bench, "realtime")
+    except HalError as error:
+        return str(error)
+    return ""
 
 
 class Firmware:
@@ -69,7 +98,8 @@ class Firmware:
             seed=choice.seed,
             stale_ms=choice.stale_ms,
             sense_only=choice.sense_only,
-            pace=choice.pace,
+            pace=choice.run_pace,
+            compiled=choice.runs_compiled,
             live_fds=fds,
             truth_s=TRUTH_S,
         )

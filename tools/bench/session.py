@@ -122,11 +122,12 @@ class Session:
     # -- firmware -------------------------------------------------------------------------------------------
 
     async def start(self, choice: Choice | None = None) -> None:
-        """End what runs and start again, with another bench if ``choice`` says so. ``HalError`` for a wrong bench."""
+        """End what runs and start again as ``choice`` says. ``HalError``, and nothing ends, for a wrong bench."""
         async with self._lock:
-            bench = load_bench((choice or self.choice).bench)
+            bench = load_bench((choice := choice or self.choice).bench)
+            await asyncio.to_thread(choice.check, bench)
             await self._end()
-            self.choice, self.bench = choice or self.choice, bench
+            self.choice, self.bench = choice, bench
             self.run, self.history, self._row, self.shadow = self._new_run(), History(self.layout), 0, None
             self.holds = HoldSpans()
             self._frame_buckets.clear()
@@ -134,7 +135,7 @@ class Session:
             self.run_number += 1
             run = self.run
             await asyncio.to_thread(self.watch.begin, bench, self.choice)
-            self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
+            self.note("info", f"starting {bench.description.name} ({choice.bench})")
             self.firmware = await Firmware.start(
                 self.choice,
                 self.layout.size,
@@ -279,6 +280,7 @@ class Session:
             "bench": self.bench.description.name,
             "bench_file": str(self.choice.bench),
             "emulated": bool(self.bench.description.emulated_buses()),
+            "compiled": self.choice.runs_compiled,
             "phase": run.phase,
             "reason": run.reason,
             "safe_ms": run.safe_ms,

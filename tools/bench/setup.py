@@ -137,7 +137,7 @@ class _Setup:
             raise InputError(f"{name} is not one of the benches in {self._session.home}")
         if self._session.recorder.active:
             raise InputError("a recording is running; stop it first: the firmware starts again")
-        await self._session.start(replace(self._session.choice, bench=path, sense_only=True))
+        await self._session.start(replace(self._session.choice, bench=path, sense_only=True, compiled=False))
 
 
 def setup_routes(session: Session) -> list[BaseRoute]:

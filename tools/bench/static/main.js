@@ -264,7 +264,7 @@ async function boot() {
     byId("log-toggle").setAttribute("aria-expanded", String(!byId("log").hidden));
   };
   link.on("state", (state) => {
-    byId("bench-name").textContent = `${state.bench}${state.emulated ? " · emulated" : ""}`;
+    byId("bench-name").textContent = `${state.bench}${state.emulated ? " · emulated" : ""}${state.compiled ? " · compiled" : ""}`;
     byId("foot").title = `${bytes(state.disk.free)} free for recordings`;
     showVitals(state);
     showRecording(state);

@@ -145,8 +145,11 @@ export function mount(root, { link, navigate, catalogue }) {
   }) }, "Write the bench file");
   const attempt = h("button", { title: "The firmware starts again with this file; nothing is armed", onclick: () => act(() => post("/api/setup/try", { path: written })) }, "Try it: sensing only");
   const folder = h("small");
-  const benches = h("select", { "aria-label": "Bench to run" });
-  const runIt = h("button", { title: "Ends what runs, in its safe state, and starts this bench", onclick: () => act(() => post("/api/firmware/start", { bench: benches.value })) }, "Run it");
+  const benches = h("select", { "aria-label": "Bench to run", onchange: () => act(askCompiled) });
+  const compiled = h("input", { type: "checkbox", disabled: true });
+  const whyNot = h("p.note", { role: "status" });
+  let canCompile = false;
+  const runIt = h("button", { title: "Ends what runs, in its safe state, and starts this bench", onclick: () => act(() => post("/api/firmware/start", { bench: benches.value, compiled: compiled.checked })) }, "Run it");
 
   root.append(h("div.cols.setup", {},
     h("section.panel", {}, h("h2", {}, "Buses ", h("small", {}, "what this machine has is offered")),
@@ -157,11 +160,25 @@ export function mount(root, { link, navigate, catalogue }) {
       h("div.wiring", {}, h("div.chips", {}, chips), h("div.slots", {}, places)),
       h("p.note", {}, "Tilt or tap one sensor: the volts that move are its own.")),
     h("section.panel", {}, h("h2", {}, "Bench file ", folder),
-      h("div.row", {}, h("label", {}, "name", name), check, write, attempt, h("button.quiet", { onclick: () => navigate("scope") }, "See it in the scope")), h("div.row", {}, h("label", {}, "another bench", benches), runIt), problem, findings, content)));
+      h("div.row", {}, h("label", {}, "name", name), check, write, attempt, h("button.quiet", { onclick: () => navigate("scope") }, "See it in the scope")), h("div.row", {}, h("label", {}, "another bench", benches), h("label", { title: "The ticks run in one compiled thread without the interpreter, on the wall clock" }, compiled, "compiled"), runIt), whyNot, problem, findings, content)));
 
   function enable() {
     for (const button of [check, write, scanButton, runIt]) button.disabled = !link.mayOrder;
     attempt.disabled = !link.mayOrder || !written;
+    compiled.disabled = !link.mayOrder || !canCompile;
+  }
+
+  /** A bench whose devices cannot run compiled says which device and why. */
+  async function askCompiled() {
+    const asked = benches.value;
+    canCompile = false;
+    enable();
+    const { why } = await get(`/api/benches/compiled?bench=${encodeURIComponent(asked)}`);
+    if (asked !== benches.value) return; // another one was chosen meanwhile
+    canCompile = !why;
+    if (why) compiled.checked = false;
+    whyNot.textContent = why;
+    enable();
   }
 
   async function refresh() {
@@ -181,8 +198,10 @@ export function mount(root, { link, navigate, catalogue }) {
     }
     const others = await get("/api/benches");
     benches.replaceChildren(...others.benches.map((path) => h("option", { value: path, selected: path === others.now }, path.split("/").pop())));
+    compiled.checked = Boolean(link.state?.compiled) && benches.value === others.now;
     showNeeded();
     enable();
+    await askCompiled();
   }
 
   const timer = setInterval(() => {
