@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import socket_line
 from benchmarks.machine import stolen_ms
 from drivers.daq.di4108 import Di4108
 from drivers.daq.di4108_kernels import READY, accept, decode
@@ -179,7 +180,9 @@ def measure(file: Path, seconds: float, tick_hz: int, *, polls: bool = False) ->
 
 
 if __name__ == "__main__":
+    if "sockets" in sys.argv[4:]:
+        socket_line.install()
     print(
-        json.dumps(measure(Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), polls=sys.argv[4:] == ["polls"])),
+        json.dumps(measure(Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3]), polls="polls" in sys.argv[4:])),
         flush=True,
     )

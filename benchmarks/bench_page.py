@@ -114,15 +114,20 @@ def quantile_us(found: list[tuple[int, int]], share: float) -> float:
     return 0.0
 
 
-def record(address: str) -> None:
-    """Start a recording, as the page's button does."""
+def post(address: str, path: str, **table: object) -> None:
+    """Make a request of the page at ``address``, as its buttons do."""
     place, _, token = address.partition("/#token=")
     request = urllib.request.Request(
-        f"{place}/api/recording/start",
-        data=json.dumps({"name": "benchmark", "notes": ""}).encode(),
+        f"{place}{path}",
+        data=json.dumps(table).encode(),
         headers={"x-micron-token": token, "content-type": "application/json"},
     )
     urllib.request.urlopen(request, timeout=60).read()
+
+
+def record(address: str) -> None:
+    """Start a recording, as the page's button does."""
+    post(address, "/api/recording/start", name="benchmark", notes="")
 
 
 def measure(bench: Path) -> dict[str, float]:

@@ -2,7 +2,11 @@
 
 Serial bench: scans come and commands go over a pty each. Default bench: scans over a pty, commands over the socket of
 the emulated I2C bus, whose own time is taken off. The bare loop (``benchmarks.bare``) answers scans of the same
-emulated world with nothing in between.
+emulated world with nothing in between. "Over a socket pair" is the serial bench with its ptys replaced
+(``socket_line``); "beside the page" is a compiled run that the bench page has started, records and shows to a viewer
+(``wire_page``).
+
+``python -m benchmarks.wire only page socket [SECONDS]`` prints the rows of these two alone, with runs of SECONDS each.
 """
 
 from __future__ import annotations
@@ -21,9 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks import socket_line
 from benchmarks.bare import Bare
 from benchmarks.machine import stolen_ms
 from benchmarks.row import Row
+from benchmarks.wire_page import run_watched
 from drivers.piezo.dac_amplifier import WIRE_BITS
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
@@ -33,6 +39,7 @@ from tools.cli.bench_option import bench_path
 I2C_HZ = 400_000
 BUS_NS = round(WIRE_BITS["command"] * 1e9 / I2C_HZ)
 COMPILED, PYTHON, SPINNING = "compiled", "Python", "compiled beside a thread that spins"
+WATCHED = "compiled beside the page"
 GOALS = (("p50", 50.0, 1.5), ("p99", 99.0, 1.5), ("p99.9", 99.9, 2.0))
 BESIDE_GOAL = 1.1
 CORE_GOAL = 0.15
@@ -45,7 +52,7 @@ FAST_BUDGETS = (
 
 class Setup(NamedTuple):
     """Describes a bench to be run: ``name`` in the rows, its file, ticks a second, the kinds of run, s of each, and the
-    time in ns of the emulated bus that a command has to wait for."""
+    time in ns of the emulated bus that a command has to wait for. ``has_sockets``: socket pairs replace its ptys."""
 
     name: str
     file: str
@@ -53,6 +60,7 @@ class Setup(NamedTuple):
     kinds: tuple[str, ...]
     run_s: float
     bus_ns: int
+    has_sockets: bool = False
 
     @property
     def period_us(self) -> float:
@@ -60,10 +68,16 @@ class Setup(NamedTuple):
 
 
 SETUPS = (
-    Setup("serial", "micron-e727.toml", 1000, (COMPILED, PYTHON, SPINNING), 12.0, 0),
-    Setup("I2C", "micron.toml", 1000, (COMPILED, PYTHON, SPINNING), 8.0, BUS_NS),
+    Setup("serial", "micron-e727.toml", 1000, (COMPILED, PYTHON, SPINNING, WATCHED), 12.0, 0),
+    Setup("I2C", "micron.toml", 1000, (COMPILED, PYTHON, SPINNING, WATCHED), 8.0, BUS_NS),
     Setup("serial at 4 kHz", "micron-e727.toml", FAST_HZ, (COMPILED, PYTHON), 5.0, 0),
+    Setup("serial over a socket pair", "micron-e727.toml", 1000, (COMPILED, PYTHON), 12.0, 0, has_sockets=True),
 )
+ONLY: dict[str, tuple[Setup, ...]] = {
+    "page": tuple(each._replace(kinds=(COMPILED, WATCHED)) for each in SETUPS[:2]),
+    "socket": SETUPS[3:],
+}
+"""Parts of the rows that can be measured alone."""
 
 
 class Run(NamedTuple):
@@ -75,6 +89,8 @@ class Run(NamedTuple):
     core: float
     main_core: float
     stolen_ms: float
+    frames_per_s: float = 0.0
+    """Frames that a viewer of the page got."""
 
     def latency_us(self, name: str) -> float:
         return self.outcome["latency"]["sample_to_command_us"][name.replace(".", "_")]
@@ -124,7 +140,8 @@ def measure_bare(setup: Setup, *, polls: bool = False) -> Bare:
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         file = bench_file(setup, Path(folder))
         command = [sys.executable, "-m", "benchmarks.bare", str(file), f"{setup.run_s:g}", f"{setup.tick_hz}"]
-        done = subprocess.run([*command, *["polls"] * polls], capture_output=True, text=True, check=False)
+        words = ["polls"] * polls + ["sockets"] * setup.has_sockets
+        done = subprocess.run([*command, *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"bare loop, {setup.name}: {(done.stderr.strip().splitlines() or ['no reason'])[-1]}")
     bare = Bare(*json.loads(done.stdout))
@@ -156,11 +173,13 @@ def _spin() -> None:
 def run_all(setup: Setup) -> None:
     """Be the firmware of each kind of run, one after another, and print their ``Run`` as JSON."""
     found: list[tuple[dict[str, Any], float, float, float]] = []
+    if setup.has_sockets:
+        socket_line.install()
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         bench = bench_file(setup, Path(folder))
         for compiled in (True, False):  # everything is compiled or loaded
             run_in_process(RunRequest(bench, 0.05, pace="realtime", compiled=compiled))
-        for kind in setup.kinds:
+        for kind in own_kinds(setup):
             if kind == SPINNING:
                 threading.Thread(target=_spin, daemon=True).start()
             began: list[float] = []
@@ -172,28 +191,50 @@ def run_all(setup: Setup) -> None:
             outcome, _ = run_in_process(request, on_open=on_open)
             took_s = time.monotonic() - began[1]
             core, main_core = (time.process_time() - began[0]) / took_s, (time.thread_time() - began[2]) / took_s
-            kept = ("latency", "ticks", "loop", "safe_state", "holds", "commands", "host")
-            figures = {key: outcome[key] for key in kept if key in outcome}
-            found.append((figures, core, main_core, stolen_ms() - began[3]))
+            found.append((figures_of(outcome), core, main_core, stolen_ms() - began[3]))
     print(json.dumps(found, default=str), flush=True)
     os._exit(0)
 
 
+def own_kinds(setup: Setup) -> list[str]:
+    """Return the kinds of run that are made in one process of firmware."""
+    return [kind for kind in setup.kinds if kind != WATCHED]
+
+
+def figures_of(outcome: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of an outcome that the rows are made of."""
+    kept = ("latency", "ticks", "loop", "safe_state", "holds", "commands", "host")
+    return {key: outcome[key] for key in kept if key in outcome}
+
+
 def measure_runs(setup: Setup) -> dict[str, Run]:
     """Return the run of each kind of ``setup``, made in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.wire", "run", str(SETUPS.index(setup))]
+    command = [sys.executable, "-m", "benchmarks.wire", "run", json.dumps(setup)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{setup.name}: {(done.stderr.strip().splitlines() or ['no reason'])[-1]}")
     made = [Run(*each) for each in json.loads(done.stdout.splitlines()[-1])]
-    return dict(zip(setup.kinds, made, strict=True))
+    runs = dict(zip(own_kinds(setup), made, strict=True))
+    if WATCHED in setup.kinds:
+        runs[WATCHED] = measure_watched(setup)
+    return runs
+
+
+def measure_watched(setup: Setup) -> Run:
+    """Return a compiled run that the page has started, records and shows to one viewer. Only its own ``cpu_share`` is
+    known of its processor time."""
+    with tempfile.TemporaryDirectory(prefix="micron-") as folder:
+        before_ms = stolen_ms()
+        outcome, frames_per_s = run_watched(bench_file(setup, Path(folder)), setup.run_s, Path(folder))
+    core = float(outcome["host"]["cpu_share"] or 0.0)
+    return Run(figures_of(outcome), core, float("nan"), stolen_ms() - before_ms, frames_per_s)
 
 
 # -- rows --------------------------------------------------------------------------------------------------
 
 
-def rows() -> Iterator[Row]:
-    for setup in SETUPS:
+def rows(setups: Sequence[Setup] = SETUPS) -> Iterator[Row]:
+    for setup in setups:
         before = measure_bare(setup)
         runs = measure_runs(setup)
         after = measure_bare(setup)
@@ -206,11 +247,14 @@ def rows() -> Iterator[Row]:
             if setup.tick_hz == 1000:
                 yield from latency_rows(setup, kind, run, bare)
             yield missed_row(setup, kind, run, bare)
-        if setup.bus_ns:
+        if setup.bus_ns and PYTHON in runs:
             yield from polled_rows(setup, measure_bare(setup, polls=True), bare)
         if SPINNING in runs:
             yield from beside_rows(setup, runs)
-        yield from core_rows(setup, runs)
+        if WATCHED in runs:
+            yield from watched_rows(setup, runs)
+        if PYTHON in runs:
+            yield from core_rows(setup, runs)
 
 
 def polled_rows(setup: Setup, polled: Bare, bare: Bare) -> Iterator[Row]:
@@ -227,7 +271,7 @@ def polled_rows(setup: Setup, polled: Bare, bare: Bare) -> Iterator[Row]:
 def latency_rows(setup: Setup, kind: str, run: Run, bare: Bare) -> Iterator[Row]:
     for name, share, factor in GOALS:
         ours, peer = run.latency_us(name) - setup.bus_ns * 1e-3, float(np.percentile(bare.late_us, share))
-        must = kind == COMPILED
+        must = kind == COMPILED and not setup.has_sockets
         yield Row(
             f"sample to command, {setup.name}, {kind}, {name}", run.what, ours, peer, "bare loop, same wires", "us",
             ours / peer, f"<= {factor:g} x" if must else "-", ours <= factor * peer if must else None, must=must,
@@ -238,7 +282,7 @@ def latency_rows(setup: Setup, kind: str, run: Run, bare: Bare) -> Iterator[Row]
 def missed_row(setup: Setup, kind: str, run: Run, bare: Bare) -> Row:
     late = max(bare.without_command, 100.0 / (2.0 * setup.run_s * setup.tick_hz))  # one scan at least
     factor = 2.0 if setup.tick_hz == 1000 else 1.0
-    must = kind == COMPILED
+    must = kind == COMPILED and not setup.has_sockets
     return Row(
         f"ticks without a command, {setup.name}, {kind}", f"skipped or caught up with in a later tick; {run.what}",
         run.without_command, late, "the same of the bare loop", "%", run.without_command / late,
@@ -257,9 +301,24 @@ def beside_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
         )  # fmt: skip
 
 
+def watched_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
+    run = runs[WATCHED]
+    what = f"the page records and shows 20 channels to one viewer, which got {run.frames_per_s:.0f} frames a second"
+    for name, _, _ in GOALS[:2]:
+        ours, peer = (runs[kind].latency_us(name) - setup.bus_ns * 1e-3 for kind in (WATCHED, COMPILED))
+        yield Row(
+            f"sample to command, {setup.name}, beside page, recorder and viewer, {name}", what, ours, peer,
+            "the same alone", "us", ours / peer,
+        )  # fmt: skip
+    yield Row(
+        f"CPU of the firmware's process, {setup.name}, beside page, recorder and viewer", what, run.core,
+        runs[COMPILED].core, "the same alone", "cores", run.core / runs[COMPILED].core,
+    )  # fmt: skip
+
+
 def core_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
     ours, peer = runs[COMPILED].core, runs[PYTHON].core
-    must = setup.tick_hz == 1000
+    must = setup.tick_hz == 1000 and not setup.has_sockets
     yield Row(
         f"CPU of the firmware's process, {setup.name}, compiled", "self-test in it; recorder and world are others'",
         ours, peer, "Python", "cores", ours / peer, f"<= {CORE_GOAL:g} cores" if must else "-",
@@ -272,8 +331,19 @@ def core_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
     )  # fmt: skip
 
 
+def print_only(words: Sequence[str]) -> None:
+    """Print the rows of parts of ``ONLY``; a number behind their names is the length of each run in s."""
+    parts = [word for word in words if word in ONLY]
+    run_s = [float(word) for word in words if word not in ONLY]
+    for part in parts:
+        for row in rows([each._replace(run_s=(run_s or [each.run_s])[0]) for each in ONLY[part]]):
+            peer = f"{row.peer_name} {row.peer:.3g}, ratio {row.ratio:.3g}"
+            print(f"{row.name}: {row.ours:.3g} {row.unit}, {peer}; {row.what}", flush=True)
+
+
 ROLES: dict[str, Callable[[Sequence[str]], None]] = {
-    "run": lambda words: run_all(SETUPS[int(words[0])]),
+    "run": lambda words: run_all(Setup(*json.loads(words[0]))),
+    "only": print_only,
 }
 
 if __name__ == "__main__":

@@ -30,6 +30,8 @@ STOP_S = 20.0
 class ProcessWorld:
     """A world in real time, in a process of its own. ``runtime_dir`` holds its sockets, log and truth."""
 
+    PROGRAM = "sim_devices.process"
+
     def __init__(
         self,
         description: dict[str, Any],
@@ -56,7 +58,7 @@ class ProcessWorld:
         self._log = self._dir / "world.log"
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                child_command("sim_devices.process", str(job_path)),
+                child_command(self.PROGRAM, str(job_path)),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
