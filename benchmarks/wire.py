@@ -310,9 +310,10 @@ def watched_rows(setup: Setup, runs: dict[str, Run]) -> Iterator[Row]:
             f"sample to command, {setup.name}, beside page, recorder and viewer, {name}", what, ours, peer,
             "the same alone", "us", ours / peer,
         )  # fmt: skip
+    ours, peer = (runs[kind].outcome["host"]["cpu_share"] for kind in (WATCHED, COMPILED))
     yield Row(
-        f"CPU of the firmware's process, {setup.name}, beside page, recorder and viewer", what, run.core,
-        runs[COMPILED].core, "the same alone", "cores", run.core / runs[COMPILED].core,
+        f"CPU of the firmware's loop, {setup.name}, beside page, recorder and viewer", what, ours, peer,
+        "the same alone", "cores", ours / peer,
     )  # fmt: skip
 
 
