@@ -22,7 +22,7 @@ from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.screen import Candidate
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
-from tools.mismatch.engine.trust import stayed
+from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.input_noise import error_of_mean
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
@@ -212,7 +212,7 @@ def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> 
     through = restarting(twin, False) if problem.split.own else twin
     whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
     course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
-    base, fitted = (over_the_whole(problem, course, f) for f in (base, fitted))
+    base, fitted = (over_the_whole(problem, course, f, posed.raw) for f in (base, fitted))
     return Ended(base, fitted, None if problem.split.own else course)
 
 
@@ -228,11 +228,12 @@ def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Record
     return recording if split is None else replace(recording, twin=split.twin)
 
 
-def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
+def over_the_whole(problem: Problem, official: Problem, fitted: Fit, given: Fit) -> Fit:
     """Fit the parameters once more in the single free run of ``official``, if that improves it there.
 
     Short stretches show which physics is missing, but do not determine parameters whose influence accumulates over the
-    whole run (an offset of the force under an integrator).
+    whole run (an offset of the force under an integrator). Parameters that break the short stretches, where the twin as
+    ``given`` does not, are not taken.
     """
     through = Model(official.twin, fitted.model.placed)
     start = residuals(official, through, fitted.theta)
@@ -243,7 +244,10 @@ def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
     )
     if not longer.ok or not after < 0.9 * before:
         return fitted
-    return replace(fitted, theta=longer.theta, residual=residuals(problem, fitted.model, longer.theta))
+    residual = residuals(problem, fitted.model, longer.theta)
+    if broken(problem, given.residual, longer.theta, residual):
+        return fitted
+    return replace(fitted, theta=longer.theta, residual=residual)
 
 
 def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool) -> tuple[Problem, Fit, Fit]:

@@ -327,20 +327,20 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     )  # fmt: skip
 
 
-def without_doubted(store: Store, answer: Answer, through: Fit, doubts: Sequence[Doubt]) -> Answer:
-    """Return ``answer`` without the effects that are in doubt in ``through``, its fit over the whole run.
+def without_doubted(store: Store, answer: Answer, through: Fit, doubt: Doubt) -> Answer:
+    """Return ``answer`` without the effect that is in doubt in ``through``, its fit over the whole run.
 
     Fewer names are no better account.
     """
     of = replace(answer.chosen, fitted=through)
-    names = {of.placed[d.k].effect.name for d in doubts}
-    smaller = store.without(answer.chosen, lambda e: e.effect.name in names)
+    name = of.placed[doubt.k].effect.name
+    smaller = store.without(answer.chosen, lambda e: e.effect.name == name)
     judged = judge(store, smaller, answer.strange, frozenset())
     return replace(
-        answer, chosen=judged.final, sure={n: p for n, p in answer.sure.items() if n not in names},
+        answer, chosen=judged.final, sure={n: p for n, p in answer.sure.items() if n != name},
         rivals=rivals_of(store, judged.final), left=_with_leads(store.problem, judged.rest), floors=judged.rest.floors,
         whole=answer.whole and judged.whole, doubtful=judged.doubtful,
-        withheld=(*answer.withheld, *(entry_of(store, of, d) for d in doubts)),
+        withheld=(*answer.withheld, entry_of(store, of, doubt)),
     )  # fmt: skip
 
 

@@ -119,7 +119,9 @@ def _through(posed: Posed, store: Store, answer: Answer, held_out: float) -> tup
         doubts = doubts_of(posed.problem, ended.fitted) if ended.fitted is not chosen.fitted else []
         if not doubts:
             return answer, decision, chosen, ended
-        answer = without_doubted(store, answer, ended.fitted, doubts)
+        # one at a time: without the weakest of two that stand for each other, the other may be certain
+        weakest = min(doubts, key=lambda d: effect_size(store, chosen, chosen.placed[d.k].effect.name))
+        answer = without_doubted(store, answer, ended.fitted, weakest)
 
 
 def least_named(store: Store) -> LeastNamed:
