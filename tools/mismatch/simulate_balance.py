@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from sim_devices.physics.effect import Array, Context
 from sim_devices.physics.statistics import least_squares, thin
-from tools.mismatch.placed import Placed
+from tools.mismatch.placed import Free, Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Balance
@@ -30,7 +30,7 @@ CALM = 0.1
 LEAST_ROWS = 50
 """Least number of samples at which the balance is weighed."""
 MOST_MOVED = 0.7
-"""Largest move of a base parameter, as a share of its value."""
+"""Largest move of a base parameter before a search begins, as a share of its value."""
 ROWS = 20_000
 """Most samples of a regression."""
 GUESSES = 2
@@ -109,15 +109,20 @@ def balanced(model: Model, k: int, view: View, theta: Array, x: Array, ctx: Cont
         at = theta.copy()
         own, _ = model.slices(k)
         at[own] = q
+        balance: Balance | None = first
         for r in range(ROUNDS):
-            balance = first if r == 0 else twin.balance(run, at[: model.n_base], pl.target)
-            assert balance is not None
+            # at numbers where the equations diverge, no state is known
+            balance = balance if r == 0 else twin.balance(run, at[: model.n_base], pl.target)
+            if balance is None:
+                break
             missing, slopes = sides(balance)
+            if not (np.all(np.isfinite(missing)) and np.all(np.isfinite(slopes))):
+                break
             found, _ = least_squares(np.column_stack([columns, slopes])[rows], missing[rows], 1e-9)
             at = _moved(model, k, at, found)
-        if np.all(np.isfinite(at)):
+        else:
             out.append(at)
-    return out
+    return [at for at in out if np.all(np.isfinite(at))]
 
 
 def _force(model: Model, placed: Placed, theta: Array, x: Array, ctx: Context) -> Array:
@@ -134,6 +139,11 @@ def _moved(model: Model, k: int, theta: Array, found: Array) -> Array:
     size = weights.stop - weights.start
     out[weights] = found[:size]
     for i, shift in enumerate(found[size:].tolist()):
-        p, most = model.parameters[i], MOST_MOVED * abs(theta[i]) if theta[i] else np.inf
-        out[i] = min(max(theta[i] + min(max(shift, -most), most), p.lo), p.hi)
+        out[i] = shifted(model.parameters[i], theta[i], shift)
     return out
+
+
+def shifted(p: Free, value: float, shift: float) -> float:
+    """Return a base parameter after a ``shift`` before a search, within ``MOST_MOVED`` and its bounds."""
+    most = MOST_MOVED * abs(value) if value else np.inf
+    return float(min(max(value + min(max(shift, -most), most), p.lo), p.hi))

@@ -13,7 +13,7 @@ from sim_devices.physics.forces import base_moves
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
-from tools.mismatch.simulate_balance import balanced
+from tools.mismatch.simulate_balance import balanced, shifted
 from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, travelled
@@ -114,10 +114,6 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
     return out
 
 
-MOST_BACK = 0.7
-"""Largest move of a base parameter before a search begins, as a fraction of its value."""
-
-
 def bent_back(
     model: Model, k: int, theta: Array, guesses: Sequence[Array], *, x: Array, residual: Array, ctx: Context
 ) -> list[Array]:
@@ -149,9 +145,7 @@ def bent_back(
         if pl.effect.basis is not None:
             other[b] = w[: b.stop - b.start]
         for i, shift in zip(searched, w[columns.shape[1] + 1 :], strict=True):
-            p = model.parameters[i]
-            most = MOST_BACK * abs(theta[i]) if theta[i] else np.inf
-            other[i] = min(max(theta[i] + float(np.clip(shift, -most, most)), p.lo), p.hi)
+            other[i] = shifted(model.parameters[i], theta[i], float(shift))
         out.append(other)
     return out
 

@@ -7,6 +7,7 @@ motion asks for. So the balance must give back every number of it.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from tools.mismatch.recording import Recording, TwinText
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_balance import balanced, bump, noise_of
 from tools.mismatch.simulate_start import prepare, probe_signals
-from tools.mismatch.twins.base import central_difference, midway
+from tools.mismatch.twins.base import Balance, central_difference, midway
+from tools.mismatch.twins.dynamic import DynamicTwin
 
 RATE_HZ, N = 500.0, 6000
 MASS, DAMPING, PERIOD, COG = 2.0, 8.0, 0.4, 1.5
@@ -91,6 +93,19 @@ def test_equations_balance_as_the_axis_does_and_not_where_a_state_was_not_record
         "lagged": "(force - lagged) / 0.01",
     }
     assert started(replace(rec, twin=TwinText("ode", hidden)), "cogging")[1] == []
+
+
+def test_equations_that_diverge_on_the_way_give_no_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = axis(1e-3, {"mass": 2.5, "damping": 6.0})
+    whole = DynamicTwin.balance
+    calls: list[int] = []
+
+    def balance(self: DynamicTwin, *of: Any) -> Balance | None:
+        calls.append(1)
+        return whole(self, *of) if len(calls) == 1 else None
+
+    monkeypatch.setattr(DynamicTwin, "balance", balance)
+    assert started(rec, "cogging")[1] == []
 
 
 def test_only_noise_gives_no_start() -> None:

@@ -72,7 +72,7 @@ def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty)
 
 
 def doubts_of(problem: Problem, fitted: Fit) -> list[Doubt]:
-    """Return why effects of a fit are not named: the figures that an essential size of theirs may be zero by."""
+    """Return the effects of a fit that are in doubt: a size that they need may be zero, or is at a limit."""
     unsure = uncertainty(problem, fitted)
     values = human_values(problem, fitted, unsure)
     found = (doubt_of(fitted, k, values.get(e.label, {}), unsure) for k, e in enumerate(fitted.model.placed))
