@@ -61,10 +61,11 @@ fuzz: setup
 	$(INSTALL) -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS) --seed $(SEED)
 
-# installs the peers that it compares with; make bench ONLY="step world" for some of it
+# installs the peers that it compares with; make bench ONLY="step world" for some of it, ROUNDS=5 for medians of five
+ROUNDS  ?= 1
 bench: setup
 	$(INSTALL) -e '.[bench]'
-	$(BIN)/python -m benchmarks $(ONLY)
+	$(BIN)/python -m benchmarks $(ONLY) --rounds $(ROUNDS)
 
 # the site in out/site; strict: a broken link or an undocumented name in the reference fails
 docs: setup

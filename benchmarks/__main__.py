@@ -1,10 +1,12 @@
-"""``make bench [ONLY="step world"]``: every benchmark, one table, ``results.json`` (contracts/commands.md).
+"""``make bench [ONLY="step world"] [ROUNDS=5]``: every benchmark, one table, ``results.json`` (contracts/commands.md).
 
-Each module runs in a process of its own: one that fails or hangs is shown as failed and the rest go on.
+Each module runs in a process of its own: one that fails or hangs is shown as failed and the rest go on. With several
+rounds a row has the medians and says within what its ratio lay.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import math
@@ -14,8 +16,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import median
 
 from rich.console import Console
 from rich.table import Table
@@ -134,16 +138,52 @@ def measure(module: str, folder: Path) -> tuple[list[Row], Failure | None]:
     return [row_of(json.loads(line)) for line in lines], failure
 
 
-def main(chosen: list[str]) -> int:
-    """Measure ``chosen``, or everything. ``--page FILE`` behind the names writes the tables to FILE, too."""
-    own_page = None
-    if chosen[-2:-1] == ["--page"]:
-        chosen, own_page = chosen[:-2], Path(chosen[-1])
+def median_rows(rounds: Sequence[Sequence[Row]]) -> list[Row]:
+    """Return one row for each name: its medians over ``rounds``, and its goal as most of them have it. ``what`` says in
+    how many rounds the goal was met and within what the ratio lay."""
+    names = list(dict.fromkeys(row.name for one in rounds for row in one))
+    return [_median_row([row for one in rounds for row in one if row.name == name]) for name in names]
+
+
+def _median_row(found: list[Row]) -> Row:
+    if len(found) == 1:
+        return found[0]
+    ratios = sorted(row.ratio for row in found)
+    what = f"{len(found)} rounds, ratio {number(ratios[0])} to {number(ratios[-1])}"
+    judged = [row.meets for row in found if row.meets is not None]
+    if judged:
+        what += f", goal met in {sum(judged)}"
+    ours, peer = median(row.ours for row in found), median(row.peer for row in found)
+    meets = 2 * sum(judged) > len(judged) if judged else None
+    why = found[-1].why if meets is False else ""
+    return replace(found[-1], what=what, ours=ours, peer=peer, ratio=median(ratios), meets=meets, why=why)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for on the command line: modules, rounds of each, and a file for the tables."""
+
+    chosen: list[str]
+    rounds: int = 1
+    page: Path | None = None
+
+
+def parse(words: Sequence[str]) -> Request:
+    """Return what ``words`` ask for: names of modules, ``--rounds N`` and ``--page FILE``."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure, and compare in one run.")
+    parser.add_argument("modules", nargs="*", choices=(*MODULES, []), metavar="MODULE", help=", ".join(MODULES))
+    parser.add_argument("--rounds", type=int, default=1, metavar="N", help="measure N times and show the medians")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the tables to FILE, too")
+    asked = parser.parse_args(words)
+    if asked.rounds < 1:
+        parser.error(f"--rounds {asked.rounds}: at least 1 round is needed")
+    return Request(asked.modules, asked.rounds, asked.page)
+
+
+def main(asked: Request) -> int:
+    """Measure the modules that are ``asked`` for, or all."""
+    chosen, own_page = asked.chosen, asked.page
     people = Console(stderr=True)
-    unknown = sorted(set(chosen) - set(MODULES))
-    if unknown:
-        people.print(f"no benchmark {', '.join(unknown)}; there are {', '.join(MODULES)}")
-        return 2
     measured: list[Row] = []
     failed: list[Failure] = []
     about = machine()
@@ -152,11 +192,16 @@ def main(chosen: list[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         for i, name in enumerate(modules, 1):
             people.print(f"measuring {name}, {i} of {len(modules)} ({time.monotonic() - began_s:.0f} s so far)")
-            rows, failure = measure(name, Path(folder))
-            measured += rows
-            if failure is not None:
-                failed.append(failure)
-                people.print(f"[bold red]{name} failed[/]: {failure.reason}", highlight=False)
+            rounds: list[list[Row]] = []
+            for _ in range(asked.rounds):
+                rows, failure = measure(name, Path(folder))
+                rounds.append(rows)
+                if failure is not None:
+                    failed.append(failure)
+                    people.print(f"[bold red]{name} failed[/]: {failure.reason}", highlight=False)
+            measured += median_rows(rounds)
+    if asked.rounds > 1:
+        about["rounds"] = asked.rounds
     about["took_s"] = round(time.monotonic() - began_s)
     out = Console(width=None if sys.stdout.isatty() else 160)
     out.print(table("Ratios within this run; absolute figures are of this machine", whole_lines(measured)))
@@ -181,4 +226,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--rows"]:
         work(sys.argv[2], Path(sys.argv[3]))
     else:
-        sys.exit(main(sys.argv[1:]))
+        sys.exit(main(parse(sys.argv[1:])))
