@@ -370,6 +370,8 @@ _SQUARED = Effect(
     report=_stribeck_report,
     vanishes_with=(("static_friction",),),
     plain="coulomb_friction",
+    # a fall that is wider than all speeds that occur is viscous, and one that is narrower is not seen
+    essential=("stribeck_speed",),
 )
 
 _TUSTIN = replace(

@@ -136,8 +136,8 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key(
                 "states",
                 "table by state",
-                "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start is a"
-                " first guess, because the first samples set the states",
+                "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start (0"
+                " if left out) must be one where the equations are finite; then the first samples set the states",
             ),
             Key(
                 "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"

@@ -36,10 +36,11 @@ class View:
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
     nearby: Nearby | None = field(default=None, compare=False, repr=False)
 
-    def near(self) -> View:
-        """Return this view, its caches shared, for one search: its start states are sought near those of its begin."""
+    def near(self, nearby: Nearby | None = None) -> View:
+        """Return this view, its caches shared, for one search: its start states are sought near those of its begin, or
+        near those of an earlier one."""
         view = object.__new__(View)
-        view.__dict__.update(self.__dict__, nearby=Nearby())
+        view.__dict__.update(self.__dict__, nearby=Nearby() if nearby is None else nearby.copy())
         return view
 
     def __getstate__(self) -> dict[str, object]:

@@ -16,6 +16,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
+from tools.mismatch.twins.memo import Nearby
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,8 @@ class Ground:
     It has ``samples`` of the recording and their ``rows`` in the view; derivatives of the outputs with respect to each
     searched parameter of the current model there (``bends[o]`` (rows, k)); and the energy of each output when
     everything free is regressed out. For a model of many parameters (``is_wide``) it also has the derivatives with
-    respect to the linear ones that move an output: their places in ``model.linear``, and (rows, places).
+    respect to the linear ones that move an output: their places in ``model.linear``, and (rows, places). ``nearby``:
+    the start states of the current model, near which candidates start.
     """
 
     rows: NDArray[np.int64]
@@ -71,6 +73,7 @@ class Ground:
     bends: dict[str, Array]
     energy: dict[str, float]
     columns: dict[str, tuple[NDArray[np.int64], Array]]
+    nearby: Nearby | None = None
 
     def of(self, output: str) -> tuple[NDArray[np.int64], Array]:
         """Return the derivatives (rows, m) of an output, and which of the parameters they belong to.
@@ -124,7 +127,7 @@ def bend(problem: Problem, current: Fit) -> Ground:
         design = model.design(problem.view, theta, samples=samples)
         place = {j: c for c, j in enumerate(model.linear)}
         columns = {o: (np.array([place[j] for j in design.linear[o]], int), design.columns[o]) for o in outputs}
-    return Ground(rows, samples, bends, energy, columns)
+    return Ground(rows, samples, bends, energy, columns, view.nearby)
 
 
 def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
@@ -179,7 +182,8 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     """Return (explained share of the mean square, p-value of the F test) of one linear step from ``theta``."""
     outputs = model.together(model.placed[-1].outputs)
     rows = ground.rows
-    view = problem.view.near()
+    same_base = np.array_equal(theta[: model.n_base], current.theta[: model.n_base])
+    view = problem.view.near(ground.nearby if same_base else None)
     design = model.design(view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]

@@ -42,6 +42,7 @@ from tools.mismatch.export.effects import FORCES, ForceCode, Slot, force, joined
 from tools.mismatch.export.motion import bend_code, sum_code
 from tools.mismatch.twins.equations import Place, Programs
 from tools.mismatch.twins.ode import PUSHED, OdeTwin
+from tools.mismatch.twins.ode_run import STEEP
 
 _CALLS = {
     ABS: "abs", SIGN: "np.sign", SQRT: "np.sqrt", EXP: "np.exp", LOG: "np.log", SIN: "np.sin", COS: "np.cos",
@@ -132,7 +133,8 @@ class EquationLines:
     twin: OdeTwin
     name: Callable[[str], str]
     """Returns the name of a signal in ``run``."""
-    substeps: int
+    substeps: tuple[int, int]
+    """Steps per sample, and parts of a step in which a body may stick, slip or turn."""
     gains: Mapping[str, float]
     """Change of the derivative at the place of a force, per unit of the force."""
     values: Array
@@ -191,7 +193,8 @@ class EquationLines:
                 swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('relative_change')} * way_{state}")
         changed = {r: ") * (".join(parts) for r, parts in swayed.items()}
         shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
-        h = "dt" if self.substeps == 1 else f"dt / {self.substeps}"
+        sub, _ = self.substeps
+        h = "dt" if sub == 1 else f"dt / {sub}"
         lines = [f'h, s, before, began = {h}, np.array(p["start"]), None, 0.0']
         lines += ["", "def derivatives(t, s, u):", f"    {_unpacked(states)} = s", f"    {_unpacked(given)} = u"]
         if turned:
@@ -270,7 +273,9 @@ class EquationLines:
         cannot take, because they stick or remember."""
         found = joined(codes)
         names, lines = self._memory(place, found)
-        lines += ["", "def step(t, s, ua, ub, uc):  # Runge and Kutta, fourth order", *self._step(place, found)]
+        whole = "" if self.substeps[1] == 1 else ", whole"
+        lines += ["", f"def step(t, s, ua, ub, uc{whole}):  # Runge and Kutta, fourth order", *self._step(place, found)]
+        names = [*names, *(["h"] if whole else [])]
         return [*lines, "", "def moving(t, drive):", f"    nonlocal {', '.join(names)}", *self._course(place, found)]
 
     def _memory(self, place: Place | None, found: ForceCode) -> tuple[list[str], list[str]]:
@@ -325,6 +330,14 @@ class EquationLines:
         ]
         if place is not None and sticks:
             i = place.velocity
+            if self.substeps[1] > 1:
+                lines += [
+                    f"    change = abs(z[{i}] - v)",
+                    f"    turns = z[{i}] * sign < change",
+                    f"    steep = abs(limit(z[{i}], sign) - limit(v, sign)) * h > {STEEP} * change",
+                    "    if whole and not stuck and (turns or steep):  # in parts",
+                    "        return None",
+                ]
             lines += [
                 f"    if stuck or z[{i}] * sign < 0:  # does the rest of the step move it again?",
                 f"        crossed = 1.0 if stuck else v / (v - z[{i}])",
@@ -332,6 +345,7 @@ class EquationLines:
                 f"        rest[{i}] = 0.0",
                 f"        after = derivatives(t + h, rest, uc)[{i}]",
                 "        over = abs(after) - limit(0.0, 1.0 if after > 0 else -1.0)",
+                *(["        if whole and over > 0:", "            return None"] if self.substeps[1] > 1 else []),
                 "        part = 0.5 * min(over / (abs(after - push) or 1.0), 1.0) if stuck else 1.0 - crossed",
                 f"        z[{i}] = np.sign(after) * max(over, 0.0) * part * h",
             ]
@@ -339,9 +353,23 @@ class EquationLines:
 
     def _course(self, place: Place | None, found: ForceCode) -> list[str]:
         """Return the body of ``moving``, which returns the states at every sample of ``drive``."""
-        again = f"for j in range({self.substeps} if before is not None else 0):"
-        head = "if before is not None:" if self.substeps == 1 else again
+        sub, fine = self.substeps
+        parts = sub * fine
+        again = f"for j in range({sub} if before is not None else 0):"
+        head = ["if before is not None:" if sub == 1 else again]
+        if fine > 1:
+            head = [f"done, until = 0 if before is not None else {parts}, 0", f"while done < {parts}:"]
         body = self._one_step()
+        if fine > 1:
+            width = f"width = 1 if done < until else {fine}"
+            body = [
+                width,
+                f"h = dt * width / {parts}",
+                *body,
+                "if z is None:",
+                "    until = done + width",
+                "    continue",
+            ]
         if place is not None and found.stiff:
             i = place.velocity
             body.append(f"bristle = bend(bristle, 0.5 * (s[{i}] + z[{i}]), h)")
@@ -351,10 +379,12 @@ class EquationLines:
         high = [s.highest for s in self.twin.state_list]
         bounded = np.any(np.isfinite(low)) or np.any(np.isfinite(high))
         body.append(f"s = np.clip(z, {_bounds(low)}, {_bounds(high)})" if bounded else "s = z")
+        if fine > 1:
+            body.append("done += width")
         return [
             "    out = np.empty((len(drive), len(s)))",
             "    for k, now in enumerate(drive):",
-            f"        {head}",
+            *(f"        {line}" for line in head),
             *("            " + line for line in body),
             "        before, began, out[k] = now, t[k], s",
             "    return out",
@@ -363,15 +393,22 @@ class EquationLines:
     def _one_step(self) -> list[str]:
         """Return the lines that take ``z`` a step further, with each input held or straight between its samples."""
         held = [bool(h) for h, s in zip(self.twin.held, self.twin.signals, strict=True) if s in self.signals]
-        start = "began" if self.substeps == 1 else "began + j * h"
+        sub, fine = self.substeps
+        start = "began" if sub == 1 else "began + j * h"
+        whole = ""
+        if fine > 1:
+            start, whole = f"began + dt * done / {sub * fine}", ", width > 1"
         if np.all(held):
-            return [f"z = step({start}, s, before, before, before)"]
+            return [f"z = step({start}, s, before, before, before{whole})"]
         end = "end" if any(held) else "now"
         lines = [f"end = np.where({held}, before, now)  # inputs that are held"] if any(held) else []
-        if self.substeps == 1:
+        if sub == fine == 1:
             return [*lines, f"z = step({start}, s, before, (before + {end}) / 2, {end})"]
-        part = f"(j + c) / {self.substeps} * ({end} - before)"
-        return [*lines, f"ua, ub, uc = (before + {part} for c in (0, 0.5, 1))", f"z = step({start}, s, ua, ub, uc)"]
+        part = f"(j + c) / {sub} * ({end} - before)"
+        if fine > 1:
+            part = f"(done + c * width) / {sub * fine} * ({end} - before)"
+        step = f"z = step({start}, s, ua, ub, uc{whole})"
+        return [*lines, f"ua, ub, uc = (before + {part} for c in (0, 0.5, 1))", step]
 
 
 def _bounds(values: Sequence[float]) -> str:

@@ -56,3 +56,7 @@ class Nearby:
     """
 
     of_stretches: dict[bytes, Start] = field(default_factory=dict[bytes, Start])
+
+    def copy(self) -> Nearby:
+        """Return the same starts for another search, which may add its own."""
+        return Nearby(dict(self.of_stretches))

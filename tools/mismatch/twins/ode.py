@@ -317,31 +317,35 @@ class OdeTwin(Head):
             fastest_of(forces),
         )
 
-    def substeps(self, dt: float, inside: Inside) -> int:
-        """Return the steps per sample, a power of two so that it seldom changes during a fit.
+    def substeps(self, dt: float, inside: Inside) -> tuple[int, int]:
+        """Return the steps per sample, and the parts of a step in which a body may stick, slip or turn.
 
-        There are four steps per radian of the fastest mode, two per radian of the stiffest memory and six per period of
-        cogging. Where dry friction may stick, there are at least two and up to eight, for 32 per radian, because a step
-        in which the velocity crosses zero is of second order only.
+        There are four steps per radian of the fastest mode, two per radian of the stiffest memory (a power of two, so
+        that it seldom changes during a fit) and six per period of cogging. Where dry friction may stick, there are at
+        least two parts per sample and up to eight, for 32 per radian, because a part in which the velocity crosses zero
+        is of second order only.
         """
         fastest_per_s = inside.fastest_per_s or self.fastest_per_s
-        sub = int(np.ceil(dt * fastest_per_s / 0.25))
+        sub, parts = int(np.ceil(dt * fastest_per_s / 0.25)), 1
         for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
             springs = float(np.sum(np.abs(rows.memory))) + max(float(rows.friction[5]), 0.0)
             stiff = dt * np.sqrt(springs) / 0.5
             if stiff > sub:
                 sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
             if np.any(rows.friction[:3] != 0.0):
-                sub = max(sub, 2, min(8, int(np.ceil(32 * dt * fastest_per_s))))
+                least = max(2, min(8, int(np.ceil(32 * dt * fastest_per_s))))
+                # a bristle bends in every step
+                sub, parts = (max(sub, least), parts) if rows.friction[5] > 0.0 else (sub, max(parts, least))
             if rows.cogging[0] > 0.0 and position != velocity:
                 sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
-        return int(np.clip(sub, 1, MOST_SUBSTEPS))
+        sub = int(np.clip(sub, 1, MOST_SUBSTEPS))
+        return sub, -(-parts // sub)
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """Return states (n, s) of a free run from start states that the measured samples of each stretch set."""
         values = self.values(theta)
         inside = self.packed(forces, values)
-        sub = self.substeps(run.dt, inside)
+        sub, fine = self.substeps(run.dt, inside)
         u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
         limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))
         starts = np.array(run.starts, np.int64)
@@ -362,7 +366,7 @@ class OdeTwin(Head):
         def go(x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array) -> Array:
             if steps is not None:
                 return steps.run(x0, u, first, stop)
-            drive = Drive(u, self.held, t, run.dt, sub, first, stop)
+            drive = Drive(u, self.held, t, run.dt, sub, fine, first, stop)
             return self.equations.states(x0, drive, values, inside, limits)
 
         given = np.array([[x.start for x in self.state_list]])
@@ -383,7 +387,7 @@ class OdeTwin(Head):
         def plain() -> Array:
             # a run of the engineer's own model from its own start gives first guesses for later stretches
             end = np.array([run.t.size], np.int64)
-            drive = Drive(u, self.held, run.t, run.dt, self.substeps(run.dt, NOTHING), starts[:1], end)
+            drive = Drive(u, self.held, run.t, run.dt, *self.substeps(run.dt, NOTHING), starts[:1], end)
             return self.equations.states(given, drive, self.start_values, NOTHING, limits)[starts]
 
         x0 = remember(run.lasting, ("about", run.starts), plain)
@@ -409,14 +413,17 @@ class OdeTwin(Head):
         part, t = u[at], run.t[at]
         tried: list[tuple[Array, Array]] = []
 
+        def missed_of(x: Array) -> Array:
+            readings = self.equations.readings(x[at], part, t, values)
+            behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
+            return (measured[seen] - behind) * weight
+
         def misses(some: Array) -> Array:
             start = x0.copy()
             start[used] = some
             x = go(start, starts, ends, u, run.t)
             tried.append((some, x))
-            readings = self.equations.readings(x[at], part, t, values)
-            behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
-            return (measured[seen] - behind) * weight
+            return missed_of(x)
 
         def moved_along(nearest: Start, missed: Array, x: Array) -> Array:
             turn = np.zeros(nearest.x0.shape)
@@ -454,14 +461,17 @@ class OdeTwin(Head):
             out = go(x0, starts, ends, u, run.t)
         if run.nearby is None or not np.all(np.isfinite(out)):
             return out
-        tried.clear()
-        missed = misses(x0[used])
-        slopes = slopes_of(x0[used], missed, misses, self.typical)
+        if every_sample is None:
+            tried.clear()
+            slopes_of(x0[used], misses(x0[used]), misses, self.typical)
+        # the runs of the round beside which the states were found; one more beside these tells little else
+        begin, turned = tried[0][1], [x for _, x in tried[1 : 1 + len(self.state_list)]]
+        states = np.stack([(x - begin) / STATE_STEP for x in turned], axis=-1)
+        slopes = np.stack([(missed_of(begin) - missed_of(x)) / STATE_STEP for x in turned], axis=-1)
         if not np.all(np.isfinite(slopes)):
             return out
-        states = np.stack([(x - tried[0][1]) / STATE_STEP for _, x in tried[1:]], axis=-1)
         run.nearby.of_stretches[starts.tobytes()] = Start(x0, states, slopes)
-        return moved_along(run.nearby.of_stretches[starts.tobytes()], missed, tried[0][1])
+        return moved_along(run.nearby.of_stretches[starts.tobytes()], missed_of(out), out)
 
     def _behind_paths(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
         """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""

@@ -16,6 +16,9 @@ SWAY = 5
 """Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and 1 if it
 follows the sign of that state's derivative (at the constant parameters) in place of the value."""
 
+STEEP = 0.25
+"""Fall of friction with speed, times a step, above which the step is taken in parts."""
+
 JOINT = 8 + SPRING
 """Number of columns of a joint: position, velocity and target of both sides, the ratio b of its travel x_1 - b x_2, the
 change of the second derivative per change of the first, and the spring (``forces.SPRING``)."""
@@ -32,6 +35,8 @@ class Drive(NamedTuple):
     step_s: float
     sub: int
     """Number of steps per sample."""
+    fine: int
+    """Number of parts of a step in which a body may stick, slip or turn."""
     starts: NDArray[np.int64]
     """First sample of each stretch."""
     stop: NDArray[np.int64]
@@ -85,13 +90,14 @@ def run_equations(program, drive, packed, x0, limits):
 
     Dry friction is set-valued: within a step the direction of slip is fixed; where the velocity crosses zero the body
     rests while the other forces are within the limit, else the rest of the step is slip the other way (Karnopp, J. Dyn.
-    Syst. Meas. Control 107, 1985, 100, without his band).
+    Syst. Meas. Control 107, 1985, 100, without his band). That is of second order only, so that a step in which a body
+    begins to slip, or is slow enough to turn, is taken in ``fine`` parts.
 
     The derivative is computed in one place of the loop and not in a function: a call that passes arrays counts
     references to each of them, which costs more than the equations.
     """
     operations, registers0, results = program
-    u, held, times, step_s, sub, starts, stop = drive
+    u, held, times, step_s, sub, fine, starts, stop = drive
     place, friction, spring, cogging, counts, thresholds, memory, flows, sway, joints = packed
     lowest, highest = limits
     n, m = u.shape
@@ -115,7 +121,8 @@ def run_equations(program, drive, packed, x0, limits):
         row = q * FRICTION
         has_limit = friction[row] != 0.0 or friction[row + 1] != 0.0 or friction[row + 2] != 0.0
         dry[q] = has_limit and friction[row + 5] <= 0.0
-    h = step_s / sub
+    kept, bent = np.zeros(thresholds.size), np.zeros(places)  # memories at the begin of a whole step
+    parts = sub * fine
     at = 0
     end = n
     for k in range(n):
@@ -131,11 +138,20 @@ def run_equations(program, drive, packed, x0, limits):
             end = stop[at]
             at += 1
         elif k < end:
-            for step in range(sub):
-                t = times[k] - step_s + step * h
+            done, until = 0, 0  # parts of the sample that are taken, and up to which parts are taken one by one
+            while done < parts:
+                width = 1 if done < until or fine == 1 else fine
+                h = step_s * width / parts
+                t = times[k] - step_s + step_s * done / parts
+                is_rough = False
+                if width > 1:
+                    kept[:] = played
+                    bent[:] = bristle[:, 0]
                 j = 0
                 # four stages, then each place where the step may have ended in rest
                 for turn in range(4 + places):
+                    if is_rough:
+                        break
                     q = turn - 4
                     stage = min(turn, 4)
                     part = 0.0 if turn == 0 else (0.5 * h if turn < 3 else h)
@@ -167,22 +183,24 @@ def run_equations(program, drive, packed, x0, limits):
                                 j += 1
                             continue
                     # the derivative at y
-                    share = (step + part / h) / sub
+                    share = (done + width * part / h) / parts
                     registers[0] = t + part
                     for i in range(s):
                         registers[1 + i] = y[i]
                     for i in range(m):
                         registers[1 + s + i] = u[k - 1, i] + (0.0 if held[i] else share * (u[k, i] - u[k - 1, i]))
-                    if turns:
+                    # twice where a parameter follows the direction in which the equations move without it
+                    for last in range(0 if turns else 1, 2):
+                        if last == 1:
+                            for c in range(sway.shape[0]):
+                                r = int(sway[c, 0])
+                                first[c] = registers[r]
+                                value = way[c] if sway[c, 4] != 0.0 else registers[int(sway[c, 1])]
+                                registers[r] *= 1.0 + sway[c, 2] * (value - sway[c, 3])
                         run_program(operations, registers)
-                        for c in range(sway.shape[0]):
-                            way[c] = np.sign(registers[results[int(sway[c, 1]) - 1]]) if sway[c, 4] != 0.0 else 0.0
-                    for c in range(sway.shape[0]):
-                        r = int(sway[c, 0])
-                        first[c] = registers[r]
-                        value = way[c] if sway[c, 4] != 0.0 else registers[int(sway[c, 1])]
-                        registers[r] *= 1.0 + sway[c, 2] * (value - sway[c, 3])
-                    run_program(operations, registers)
+                        if last == 0:
+                            for c in range(sway.shape[0]):
+                                way[c] = np.sign(registers[results[int(sway[c, 1]) - 1]]) if sway[c, 4] != 0.0 else 0.0
                     for c in range(sway.shape[0] - 1, -1, -1):
                         registers[int(sway[c, 0])] = first[c]
                     for i in range(s):
@@ -206,13 +224,13 @@ def run_equations(program, drive, packed, x0, limits):
                             f -= memory[i] * min(max(p - played[i], -thresholds[i]), thresholds[i])
                         e += counts[c]
                         if friction[row + 5] > 0.0:
-                            bent, since = bristle[c, 0], part
+                            deflection, since = bristle[c, 0], part
                             if turn == 0:
                                 bristle[c, 1] = v
                             elif turn > 3:
                                 since = 0.0
                             mean = 0.5 * (bristle[c, 1] + v)
-                            f -= friction[row + 5] * bristle_after(bent, mean, since, friction, row)
+                            f -= friction[row + 5] * bristle_after(deflection, mean, since, friction, row)
                         rates[stage, place[c, 2]] += f
                     if turn == 0:
                         for c in range(places):
@@ -238,11 +256,23 @@ def run_equations(program, drive, packed, x0, limits):
                             for i in range(s):
                                 f = rates[0, i] + 2.0 * rates[1, i] + 2.0 * rates[2, i] + rates[3, i]
                                 z[i] = x[i] + h / 6.0 * f
+                            if width > 1:
+                                for c in range(places):
+                                    if mode[c] == 1 or mode[c] == -1:
+                                        v, vn, row = x[place[c, 1]], z[place[c, 1]], c * FRICTION
+                                        sign, fall = float(mode[c]), 0.0
+                                        if friction[row + 2] != 0.0:
+                                            fall = friction_limit(v, sign, friction, row)
+                                            fall = abs(fall - friction_limit(vn, sign, friction, row))
+                                        if vn * sign < abs(vn - v) or fall * h > STEEP * abs(vn - v):
+                                            is_rough = True
                     else:
                         push = rates[4, place[q, 2]]
                         sign = 1.0 if push > 0.0 else -1.0
                         over = abs(push) - friction_limit(0.0, sign, friction, q * FRICTION)
                         vn = 0.0
+                        if over > 0.0 and width > 1:
+                            is_rough = True
                         if over > 0.0 and mode[q] != 2:
                             # the rest of the step is slip in the other direction
                             vn = sign * over * (1.0 - crossed[q]) * h
@@ -254,6 +284,12 @@ def run_equations(program, drive, packed, x0, limits):
                         for _ in range(counts[q]):
                             played[j] = min(max(played[j], p - thresholds[j]), p + thresholds[j])
                             j += 1
+                if is_rough:
+                    until = done + width
+                    played[:] = kept
+                    bristle[:, 0] = bent
+                    continue
+                done += width
                 for i in range(s):
                     x[i] = min(max(z[i], lowest[i]), highest[i])
         for i in range(s):

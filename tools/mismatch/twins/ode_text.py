@@ -179,7 +179,7 @@ def _as_given(
         sub = int(np.clip(np.ceil(recording.dt * fastest / 0.25), 1, 200))
         inputs = np.ascontiguousarray(u)
         whole = np.zeros(1, np.int64), np.array([n], np.int64)
-        drive = Drive(inputs, held, recording.t, recording.dt, sub, *whole)
+        drive = Drive(inputs, held, recording.t, recording.dt, sub, 1, *whole)
         x = equations.states(x0, drive, values, NOTHING, limits)
     if not np.all(np.isfinite(x)):
         k = int(np.argmax(~np.isfinite(x).all(axis=1)))

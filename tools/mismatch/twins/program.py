@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hal.compiled import kernel
+from hal.compiled import inlined_kernel
 from tools.guest.equations import (
     ADD,
     DIV,
@@ -30,7 +30,7 @@ from tools.guest.equations import (
 )
 
 
-@kernel
+@inlined_kernel
 def run_program(operations, registers):
     """Carry out the operations; ``registers`` (r,) change in place."""
     for i in range(operations.shape[0]):

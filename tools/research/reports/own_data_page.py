@@ -119,14 +119,16 @@ hold = "zero"
 The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stand there or, as here, in `[twin]`:
 `[twin.states]` and `[twin.parameters.states]` are the same; so are the `states` of a `state_space`.
 
-Matrices of a `state_space` are read in SI, equations of an `ode` in the units of the columns unless `units` says
-otherwise. Where only the other reading moves as much as the recording does, it is taken, with a note. The equation of
-an encoder's output holds its counts: `outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`, if given,
-includes the rounding (0.29 counts). A `mechanical_axis` with the input `torque` turns; with `force` it slides. Of
-simulated `columns` only scale and offset are re-fitted: a wrong time constant of the simulation appears as an effect.
+Matrices of a `state_space` are read in SI (degC stays degC), equations of an `ode` in the units of the columns unless
+`units` says otherwise. Where only the other reading moves as much as the recording does, it is taken, with a note. The
+equation of an encoder's output holds its counts: `outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`,
+if given, includes the rounding (0.29 counts). A `mechanical_axis` with the input `torque` turns; with `force` it
+slides. Of simulated `columns` only scale and offset are re-fitted: a wrong time constant of the simulation appears as
+an effect.
 
 `micron mismatch simulate .` runs the twin that the recording describes and prints what was read (samples, rate, units,
 holds, notes) and the residual, also as a share of the output. A wrong unit or sign shows here, before the diagnosis.
+The first command of a version compiles for up to a minute. `micron mismatch physics` lists what can be named.
 
 Name the commanded value as input where there is one. A measured input has noise. An effect that smooths this noise (a
 lag, a resonance) then predicts better, although the machine has no such effect. State the input's `noise_rms`, and the
