@@ -11,13 +11,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_model.ode_systems import CHANNELS, PENDULUM, RATE_HZ, command, pendulum, recorded
+from tests.unit.mismatch_model.ode_systems import CHANNELS, MOTOR, PENDULUM, RATE_HZ, command, pendulum, recorded
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.base import Force
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.ode import inside_of
+from tools.mismatch.twins.ode_run import Drive
 
 
 def test_dry_friction_brings_a_body_to_rest_and_keeps_it_there(tmp_path: Path) -> None:
@@ -46,6 +49,36 @@ speed = "command"
     residual = model.residual(View.whole(recording), theta)["angle"]
     assert np.max(np.abs(residual)) < 1e-4
     assert np.ptp(model.simulate(View.whole(recording), theta)["angle"][160:]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "searched", "weights"),
+    [("coulomb_friction", (), (4.0, 0.0, 0.0)), ("stribeck_friction", (0.5,), (4.0, 0.0, 0.0, 6.0))],
+)
+def test_parts_of_a_step_where_a_body_sticks_are_about_as_good_as_parts_throughout(
+    name: str, searched: tuple[float, ...], weights: tuple[float, ...], tmp_path: Path
+) -> None:
+    recording = recorded(tmp_path, MOTOR, 0.5 * command(), 0.1 * command())
+    twin = inside_of(make(recording))
+    assert twin is not None
+    place = sites(twin, recording, EFFECTS[name])[0]
+    values = twin.values(Model(twin).start(recording))
+    force = Force(place.effect, {"speed": (5.0,)}, np.array(searched), np.array(weights), 0, place.target)
+    inside = twin.packed([force], values)
+    whole = np.zeros(1, np.int64), np.array([recording.n], np.int64)
+    u = np.ascontiguousarray(recording.inputs["command"][:, None])
+    limits = np.full(2, -np.inf), np.full(2, np.inf)
+
+    def run(sub: int, fine: int) -> np.ndarray:
+        drive = Drive(u, twin.held, recording.t, recording.dt, sub, fine, *whole)
+        return twin.equations.states(np.zeros((1, 2)), drive, values, inside, limits)[:, 1]
+
+    true = run(512, 1)
+    rough, throughout, parts = (np.std(run(*steps) - true) for steps in ((1, 1), (8, 1), (1, 8)))
+    assert np.any(true == 0.0)
+    assert np.ptp(true) > 1.0
+    assert parts < 1.5 * throughout  # whole steps between add their own error
+    assert rough > 5.0 * parts
 
 
 def test_forces_of_an_axis_and_of_equations_are_the_same(tmp_path: Path) -> None:
