@@ -161,7 +161,7 @@ def _median_row(found: list[Row]) -> Row:
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for on the command line: modules, rounds of each, and a file for the tables."""
+    """Holds what the command line asks for: modules, rounds of each, and a file for the tables."""
 
     chosen: list[str]
     rounds: int = 1
@@ -171,10 +171,12 @@ class Request:
 def parse(words: Sequence[str]) -> Request:
     """Return what ``words`` ask for: names of modules, ``--rounds N`` and ``--page FILE``."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure, and compare in one run.")
-    parser.add_argument("modules", nargs="*", choices=(*MODULES, []), metavar="MODULE", help=", ".join(MODULES))
+    parser.add_argument("modules", nargs="*", metavar="MODULE", help=", ".join(MODULES))
     parser.add_argument("--rounds", type=int, default=1, metavar="N", help="measure N times and show the medians")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the tables to FILE, too")
     asked = parser.parse_args(words)
+    if unknown := sorted(set(asked.modules) - set(MODULES)):
+        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(MODULES)}")
     if asked.rounds < 1:
         parser.error(f"--rounds {asked.rounds}: at least 1 round is needed")
     return Request(asked.modules, asked.rounds, asked.page)

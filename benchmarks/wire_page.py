@@ -15,6 +15,7 @@ from benchmarks.bench_page import CHANNELS, VIEWER, post, record, state
 from tools.research.pictures import started
 
 END_S = 60.0
+START_S = 120.0
 
 
 def run_watched(bench: Path, seconds: float, folder: Path) -> tuple[dict[str, Any], float]:
@@ -27,8 +28,11 @@ def run_watched(bench: Path, seconds: float, folder: Path) -> tuple[dict[str, An
     with patch.dict(os.environ, TMPDIR=str(folder)), started(*options) as (_, address):
         url = address.partition("/#")[0].replace("http", "ws") + "/live"
         post(address, "/api/firmware/start", compiled=True)
+        until_s = time.monotonic() + START_S
         while (now := state(url))["status"].get("state") != "running":
             require_run(now)
+            if time.monotonic() > until_s:
+                raise RuntimeError(f"the compiled run behind the page was not armed within {START_S:g} s")
             time.sleep(0.1)
         record(address)
         command = [sys.executable, "-c", VIEWER, url, str(seconds), subscription]
