@@ -3,9 +3,10 @@
 The converter averages over its conversion, so what is measured must be a mean of the commands that were in force
 meanwhile, each with a weight between the shortest and the longest time that it can have been in force: no model of
 the amplifier is needed, only how long it may take to settle. What a healthy output differs by (gain and offset of
-amplifier and divider) is learnt within the tolerance, and a change of it is as suspicious as a difference beyond the
-tolerance. A suspicious output is looked at once more before anything is said. Wired to the
-stack's terminals it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
+amplifier and divider) is learnt within the tolerance where the commands are known well enough, and a change of it is
+as suspicious as a difference beyond the tolerance. A suspicious output is looked at once more before anything is said.
+Wired to the stack's terminals it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier
+only.
 """
 
 from __future__ import annotations
@@ -34,27 +35,41 @@ class Window(NamedTuple):
     shortest_ns: int
 
 
-LEARN = 60
-"""Number of readings of an output before its usual deviation counts as known; the memory is four times as long."""
+MEMORY = 240
+"""Number of readings of an output after which an older one counts 1/e in what is usual."""
+LEARN = 20.0
+"""Sum of the weights of the readings with which the usual difference of an output counts as known."""
 
 
 class Usual:
-    """Fits a straight line to the recent differences of one output from the middle of its expected range."""
+    """Fits a straight line to the recent differences of one output from the middle of its expected range.
 
-    def __init__(self) -> None:
-        self.count = 0
+    A middle may be off by half the range. So it is learnt from ranges up to ``2 * change_V`` alone: then the line
+    is off by ``change_V`` at most, and no healthy reading looks like a change. A slow bus leaves wider ranges; with
+    nothing else for ``MEMORY`` readings the line is forgotten.
+    """
+
+    def __init__(self, change_V: float) -> None:
+        self._widest_V = 2.0 * change_V
         self._sums = [0.0] * 5  # 1, x, x x, y, x y, forgetting
 
+    @property
+    def is_known(self) -> bool:
+        return self._sums[0] >= LEARN
+
     def at(self, x_V: float) -> float:
+        """Return the usual difference (V) at ``x_V``."""
         n, sx, sxx, sy, sxy = self._sums
         slope = (sxy - sx * sy / n) / (sxx - sx * sx / n + n)  # prior of the slope: 0 +- the difference over 1 V rms
         return sy / n + slope * (x_V - sx / n)
 
-    def learn(self, x_V: float, y_V: float) -> None:
-        keep = 1.0 - 0.25 / LEARN
+    def learn(self, span_V: tuple[float, float], measured_V: float) -> None:
+        """Learn from a healthy reading whose command was within ``span_V``."""
+        x_V = 0.5 * (span_V[0] + span_V[1])
+        y_V = measured_V - x_V
+        weight = float(span_V[1] - span_V[0] <= self._widest_V)
         new = (1.0, x_V, x_V * x_V, y_V, x_V * y_V)
-        self._sums = [keep * old + term for old, term in zip(self._sums, new, strict=True)]
-        self.count += 1
+        self._sums = [(1.0 - 1.0 / MEMORY) * old + weight * term for old, term in zip(self._sums, new, strict=True)]
 
 
 class AmplifierMonitor:
@@ -90,7 +105,7 @@ class AmplifierMonitor:
         self._ratio = ratio
         self._tolerance_V = tolerance_V
         self._change_V = change_V
-        self._usual = [Usual() for _ in channels]
+        self._usual = [Usual(change_V) for _ in channels]
         self._settle_ns = round(settle_s * 1e9)
         nominal_ns = (adc.conversion_ns - WAKE_UP_NS) / (1.0 + RATE_TOLERANCE)
         self._longest_ns = round(nominal_ns * (1.0 + RATE_TOLERANCE))
@@ -186,6 +201,8 @@ class AmplifierMonitor:
             self._suspected[output] = True
             return ""
         expected = f"{span[0]:.2f} V" if span[1] - span[0] < 0.005 else f"{span[0]:.2f} to {span[1]:.2f} V"
+        if beyond_V <= self._tolerance_V:
+            expected += f", from which it usually differs by {self._usual[output].at(0.5 * sum(span)):+.2f} V"
         return (
             f"output {output + 1} is at {measured_V:.2f} V and was told {expected}: the amplifier, its supply, a cable "
             f"or a stack is broken (or {self.name} is); switch the amplifier off"
@@ -194,13 +211,13 @@ class AmplifierMonitor:
     def _is_odd(self, output: int, measured_V: float, span: tuple[float, float]) -> bool:
         if not span[0] - self._tolerance_V <= measured_V <= span[1] + self._tolerance_V:
             return True
-        usual, middle_V = self._usual[output], 0.5 * (span[0] + span[1])
-        if usual.count >= LEARN:
+        usual = self._usual[output]
+        if usual.is_known:
             # the uncertainty of the commands stays; only gain and offset are known better
-            healthy_V = measured_V - usual.at(middle_V)
+            healthy_V = measured_V - usual.at(0.5 * (span[0] + span[1]))
             if not span[0] - self._change_V <= healthy_V <= span[1] + self._change_V:
                 return True
-        usual.learn(middle_V, measured_V - middle_V)
+        usual.learn(span, measured_V)
         return False
 
 

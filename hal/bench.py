@@ -294,9 +294,14 @@ class OpenBench:
 EMULATED_CLOCKS: Mapping[Pace, Callable[[int], VirtualClock]] = {"paced": PacedClock, "virtual": VirtualClock}
 
 
+def is_emulated(description: BenchDescription) -> bool:
+    """Return True if every bus is emulated, so that no real output can move."""
+    return len(description.emulated_buses()) == len(description.bus)
+
+
 def default_pace(description: BenchDescription) -> Pace:
     """Return ``paced`` if every bus is emulated, else ``realtime``."""
-    return "paced" if len(description.emulated_buses()) == len(description.bus) else "realtime"
+    return "paced" if is_emulated(description) else "realtime"
 
 
 def check_pace(bench: BenchFile, pace: Pace | None) -> Pace:

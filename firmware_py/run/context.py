@@ -32,7 +32,8 @@ class Run:
     ``guardian`` looks after its guardian process. ``limits`` are ``[firmware.safety]`` of the bench file.
     ``on_status`` gets a small dict now and then and must not block. ``sense_only``: nothing is armed, and a reading
     that would end a run is only noticed. ``others_stalled_ms(now_ns, within_ms)`` returns how long another process of
-    this host, which answers for devices, stands or stood still.
+    this host, which answers for devices, stands or stood still. ``spares_host``: pauses of this host do not end the run
+    by their number, because no device is real.
     """
 
     clock: Clock
@@ -45,6 +46,7 @@ class Run:
     guardian: GuardianCare | None = None
     sense_only: bool = False
     others_stalled_ms: Callable[[int, float], float] | None = None
+    spares_host: bool = False
 
     counts: LoopCounts = field(init=False, default_factory=LoopCounts)
     signals: Signals = field(init=False, default_factory=Signals)
@@ -69,7 +71,9 @@ class Run:
 
     def __post_init__(self) -> None:
         self.supervisor = Supervisor(self.output)
-        self.incidents = Incidents(self.supervisor, self.counts, self.clock, self.recorder, self.limits)
+        self.incidents = Incidents(
+            self.supervisor, self.counts, self.clock, self.recorder, self.limits, spares_host=self.spares_host
+        )
         self.host_gaps = HostGaps(self.limits.stale_ms)
 
     def publish(self, frame: NDArray[np.float64]) -> None:

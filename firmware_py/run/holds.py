@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.run.findings import Finding
+from firmware_py.run.findings import CauseClass, Finding
 from firmware_py.run.safety import Hold, SafetyLimits, State, Supervisor
 
 MINUTE_NS = 60_000_000_000
@@ -15,10 +15,14 @@ OPERATOR = "the operator"
 
 
 class Holds:
-    """Counts holds and decides when one may end. ``waits_for`` says in words what the hold waits for."""
+    """Counts holds and decides when one may end. ``waits_for`` says in words what the hold waits for.
 
-    def __init__(self, limits: SafetyLimits, supervisor: Supervisor) -> None:
+    ``spares_host``: a hold that this host has caused does not count towards ``holds_per_minute``.
+    """
+
+    def __init__(self, limits: SafetyLimits, supervisor: Supervisor, *, spares_host: bool = False) -> None:
         self.waits_for = ""
+        self._spares_host = spares_host
         self._limits = limits
         self._supervisor = supervisor
         self._good_since_ns = 0
@@ -33,8 +37,12 @@ class Holds:
         return self._supervisor.holds[-1] if self._supervisor.is_holding else None
 
     def within_a_minute(self, now_ns: int) -> int:
-        """Return the number of holds that began within the last minute."""
-        return sum(now_ns - hold.t_ns < MINUTE_NS for hold in self._supervisor.holds)
+        """Return the number of holds that began within the last minute and count."""
+        return sum(now_ns - hold.t_ns < MINUTE_NS for hold in self._supervisor.holds if self.counts(hold.cause))
+
+    def counts(self, cause: CauseClass) -> bool:
+        """Return True if a hold of this cause counts towards ``holds_per_minute``."""
+        return cause is not CauseClass.HOST or not self._spares_host
 
     def interrupt(self, now_ns: int, why: str) -> None:
         """Restart the time that must be good without interruption, because of ``why``."""

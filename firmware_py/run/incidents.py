@@ -57,6 +57,8 @@ class Incidents:
         clock: Clock,
         recorder: Recorder | None,
         limits: SafetyLimits | None = None,
+        *,
+        spares_host: bool = False,
     ) -> None:
         self._limits = limits or SafetyLimits()
         self._supervisor = supervisor
@@ -64,7 +66,7 @@ class Incidents:
         self._clock = clock
         self._recorder = recorder
         self._bad_since: dict[Finding, int] = {}
-        self.holds = Holds(self._limits, supervisor)
+        self.holds = Holds(self._limits, supervisor, spares_host=spares_host)
         self.tick = -1
         self.error: HalError | None = None
 
@@ -119,7 +121,10 @@ class Incidents:
                 self.holds.wait_out_host(now_ns, reason)
         elif supervisor.state is not State.RUNNING or self._limits.holds_per_minute == 0:
             self._trip(finding, reason)
-        elif (count := self.holds.within_a_minute(now_ns) + 1) > self._limits.holds_per_minute:
+        elif (
+            self.holds.counts(finding.value.cause)
+            and (count := self.holds.within_a_minute(now_ns) + 1) > self._limits.holds_per_minute
+        ):
             text = Finding.TOO_MANY_HOLDS.value.says.format(
                 count=count, limit=self._limits.holds_per_minute, what=reason
             )

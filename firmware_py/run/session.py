@@ -19,7 +19,8 @@ from firmware_py.run.loop import Loop
 from firmware_py.run.outcome import Ending, describe_host, make_outcome
 from firmware_py.run.safety import SafetyLimits
 from firmware_py.run_request import RunRequest, count_interrupts, describe_machine, scheduling
-from hal.bench import BenchFile, OpenBench
+from hal.bench import BenchFile, OpenBench, is_emulated
+from hal.clock import MonotonicClock
 
 
 def run_plan(
@@ -55,6 +56,7 @@ def run_plan(
             guardian=output.care,
             sense_only=request.sense_only,
             others_stalled_ms=opened.world.stalled_ms if opened.world is not None else None,
+            spares_host=isinstance(opened.clock, MonotonicClock) and is_emulated(opened.file.description),
         )
         machine, summary, scheduled = describe_machine(opened), None, dict[str, Any]()
         interrupts = stack.enter_context(count_interrupts()) if own_process else lambda: 0

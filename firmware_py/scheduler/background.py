@@ -1,4 +1,8 @@
-"""Runs background tasks: generators that run in the slack between ticks, one declared step at a time."""
+"""Runs background tasks: generators that run in the slack between ticks, one declared step at a time.
+
+A loop without slack would show nothing, just when something is to be seen: what has waited for ``PATIENCE_NS`` takes
+one step all the same, and the tick after it comes late.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,11 @@ from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.statistics import BackgroundSnapshot
 from firmware_py.scheduler.task import BackgroundSpec
 
+PATIENCE_NS = 500_000_000
+
 
 class _LiveBackground:
-    __slots__ = ("duration", "finished", "last_error", "overruns", "spec", "step", "steps", "worst_ns")
+    __slots__ = ("duration", "finished", "last_error", "last_ns", "overruns", "spec", "step", "steps", "worst_ns")
 
     def __init__(self, spec: BackgroundSpec) -> None:
         self.spec = spec
@@ -19,6 +25,7 @@ class _LiveBackground:
         self.duration = DurationHistogram()
         self.finished = False
         self.last_error = ""
+        self.last_ns: int | None = None  # the time from which it waits
         self.clear()
 
     def clear(self) -> None:
@@ -36,7 +43,8 @@ class Slack:
         self._turn = 0
 
     def run(self, until_ns: int, tick: int) -> int:
-        """Run steps that end before ``until_ns`` if they keep their promise; return how many ran.
+        """Run steps that end before ``until_ns`` if they keep their promise, and one of each task that has waited for
+        ``PATIENCE_NS``; return how many ran.
 
         A task that yields False (nothing to do) is left alone until the next call; one that returns is
         finished; one that raises is marked, finished, and its exception goes on to the caller.
@@ -47,8 +55,11 @@ class Slack:
             again: list[_LiveBackground] = []
             for task in waiting:
                 started_ns = self._now_ns()
-                if started_ns + task.worst_ns > until_ns:
+                if task.last_ns is None:
+                    task.last_ns = started_ns
+                if started_ns + task.worst_ns > until_ns and started_ns - task.last_ns < PATIENCE_NS:
                     continue
+                task.last_ns = started_ns
                 self._turn = (self._live.index(task) + 1) % len(self._live)
                 if self._step(task, started_ns, tick):
                     again.append(task)

@@ -137,7 +137,6 @@ def test_a_compiled_run_is_shown_recorded_and_ended_by_the_safe_button(server: S
     assert not [line for line in recording.health.lines() if "torn" in line]
 
 
-@pytest.mark.slow  # on a slow machine its run does not come to "running", or ends unseen: not understood
 @pytest.mark.realtime
 def test_a_page_that_is_killed_leaves_the_outputs_of_a_compiled_run_at_neutral() -> None:
     """The firmware ends as it does on SIGTERM when its server has gone, and nobody waits for it."""

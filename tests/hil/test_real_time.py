@@ -71,8 +71,9 @@ def test_losing_the_link_in_real_time_ends_safe_and_names_it(tmp_path: Path, blo
 
     request = RunRequest(bench, 30.0, pace="realtime", compiled=compiled)
     outcome, truth = run_in_process(request, start_when_running, on_open=prepare)
-    timers[0].join()
     safe = outcome["safe_state"]
+    assert timers[0].ident is not None, f"the run ended before the blow: {safe['reason']}"
+    timers[0].join()
     assert not safe["normal"]
     # all links of a killed world die at once; which one is asked first is chance
     assert safe["reason"].startswith(("daq: ", "piezo: ") if blow == "kill" else "daq: ")

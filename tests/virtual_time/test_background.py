@@ -110,6 +110,19 @@ def test_an_exception_is_marked_and_reaches_the_owner() -> None:
     assert scheduler.run_slack(MS) == 0
 
 
+def test_a_loop_without_slack_still_runs_a_step_each_half_second() -> None:
+    clock = VirtualClock()
+    worker = Worker(clock, cost_us=100.0, items=1000)
+    scheduler = make(clock, BackgroundSpec("bg", worker.steps, worst_step_us=150.0))
+    for k in range(1300):
+        clock.advance_to(k * MS)
+        scheduler.tick(k * MS, k)
+        clock.burn_ns(500 * US)  # the machine stands still: 900 us of each tick are gone
+        scheduler.run_slack((k + 1) * MS)
+    assert worker.done_at_ns == [501 * MS, 1001 * MS]
+    assert clock.now_ns() == 1299 * MS + 900 * US
+
+
 def test_a_step_that_never_fits_is_refused_at_start() -> None:
     clock = VirtualClock()
     worker = Worker(clock, 100.0, 1)

@@ -18,8 +18,8 @@ MS = 1_000_000
 class Stand:
     """A running supervisor with an amplifier that is at neutral at once."""
 
-    def __init__(self, state: State = State.RUNNING, **limits: Any) -> None:
-        run = StandRun(state, SafetyLimits(**limits))
+    def __init__(self, state: State = State.RUNNING, *, spares_host: bool = False, **limits: Any) -> None:
+        run = StandRun(state, SafetyLimits(**limits), spares_host=spares_host)
         self.clock, self.limits, self.counts = run.clock, run.limits, run.counts
         self.supervisor, self.incidents = run.supervisor, run.incidents
         self.clock.burn_ns(1000 * MS)
@@ -91,6 +91,23 @@ def test_the_fourth_hold_within_a_minute_is_none_and_says_so():
     assert stand.supervisor.trip_cause is not None
     assert stand.supervisor.trip_cause.cause is CauseClass.LINK
     assert len(stand.supervisor.holds) == 3
+
+
+def test_pauses_of_the_host_do_not_count_where_no_device_is_real():
+    stand = Stand(spares_host=True)
+    for _ in range(5):
+        stand.incidents.report(Finding.HOST_OVERSLEPT, stall_ms=9.0, device="daq")
+        stand.supervisor.step()
+        assert stand.may_end_after(200.0)
+        stand.resume()
+    for _ in range(3):
+        stand.held()
+        assert stand.may_end_after(200.0)
+        stand.resume()
+    assert not stand.trip
+    assert len(stand.supervisor.holds) == 8
+    stand.silence()
+    assert stand.trip.startswith("hold 4 within a minute")
 
 
 def test_a_minute_later_it_is_the_first_again():

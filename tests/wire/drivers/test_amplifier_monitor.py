@@ -200,6 +200,26 @@ def test_a_small_change_of_what_is_usual_is_seen_within_the_tolerance():
     assert said
     assert said[0][0] - 1000 <= 20
     assert said[0][1].startswith("output 3 is at ")
+    assert "V, from which it usually differs by +" in said[0][1]
+
+
+def test_a_bus_that_waits_is_no_change_of_what_is_usual():
+    """A host that stands still within transfers leaves wide ranges of commands; the true means lie at their ends."""
+    stand = Stand()
+    known = Window(0, 0, MS, MS)
+    for k in range(400):
+        t_ms = 20 * k
+        told_at(stand, *((t_ms + i, t_ms + i + 0.1, 40.0 + i) for i in range(8)))
+        waited = Window((t_ms + 2) * MS, (t_ms + 6) * MS, MS, MS)  # its order took 4 ms
+        lowest_V, highest_V = stand.monitor.expected_V(0, waited) or (0.0, 0.0)
+        assert highest_V - lowest_V > 3.0
+        assert stand.monitor._judge(0, waited, lowest_V if k < 300 else highest_V) == ""
+        told_at(stand, *((t_ms + i, t_ms + i + 0.1, 47.0) for i in range(8, 16)))
+        known = Window((t_ms + 12) * MS, (t_ms + 12) * MS, MS, MS)
+        assert stand.monitor._judge(0, known, 47.0) == ""
+    assert stand.monitor.suspicions == 0
+    assert stand.monitor._judge(0, known, 47.2) == ""
+    assert "usually differs by +0.00 V" in stand.monitor._judge(0, known, 47.2)
 
 
 def test_what_changes_slowly_becomes_usual():
@@ -218,9 +238,9 @@ def test_a_change_while_nothing_is_known_yet_is_judged_by_the_tolerance_alone():
 
 
 def test_the_usual_line_is_the_one_through_the_readings():
-    usual = Usual()
+    usual = Usual(0.15)
     for k in range(400):
         x = 20.0 * np.sin(0.7 * k)
-        usual.learn(50.0 + x, 0.1 + 0.02 * x)
+        usual.learn((49.9 + x, 50.1 + x), 50.1 + 1.02 * x)
     assert usual.at(50.0) == pytest.approx(0.1, abs=1e-3)
     assert usual.at(70.0) == pytest.approx(0.5, abs=3e-3)  # the slope is drawn to 0 by 1 V^2 of 200 V^2

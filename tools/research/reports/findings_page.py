@@ -30,7 +30,8 @@ With `rearm = "operator"` a person ends the hold by the page's button (order `re
 firmware's process; asked for earlier than the cause has passed, nothing happens, and the recording notes it. A run does
 not end within a hold whose cause has not passed: it waits for the end of the hold, or latches with it.
 
-The class says where the cause is: this host, the link, the device, or the operator.
+The class says where the cause is: this host, the link, the device, or the operator. In real time with every bus
+emulated (`--realtime`, `--compiled`) holds of the class "host" do not count towards `holds_per_minute`.
 
 | finding | class | answer | message | why |
 |---|---|---|---|---|
