@@ -92,8 +92,8 @@ noise_rms = 0.02
 
 `hold = "zero"` says that a computer held the force over each sample. Without it the verdict here is `unexplained`,
 although friction is named. `noise_rms` is the rms of all noise of the readings, hum and slow noise included; the
-residual tells its spectrum. A wrong one is the usual cause of a wrong verdict: leave it out if you do not know it. Where
-inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give each its own:
+residual tells its spectrum. A wrong one is the usual cause of a wrong verdict: leave it out if you do not know it.
+Where inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give each its own:
 `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function ([a twin of your own](adding/twin.md)). An output that has the name of
@@ -122,8 +122,8 @@ The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stan
 `[twin.states]` and `[twin.parameters.states]` are the same; so are the `states` of a `state_space`.
 
 Matrices of a `state_space` are read in SI (degC stays degC). Its poles, the numerators from each input to each output
-and `y0` are re-fitted, because the data do not tell one choice of states from another. Equations of an `ode` are read in
-the units of the columns unless `units` says otherwise: after `units = { current = "A", bearing = "N m s" }` the fan
+and `y0` are re-fitted, because the data do not tell one choice of states from another. Equations of an `ode` are read
+in the units of the columns unless `units` says otherwise: after `units = { current = "A", bearing = "N m s" }` the fan
 above may record its current in mA, and the report has a unit for `bearing`. Where only the other reading moves as much
 as the recording does, it is taken, with a note. The
 equation of an encoder's output holds its counts: `outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`,
