@@ -44,9 +44,9 @@ LEARN = 20.0
 class Usual:
     """Fits a straight line to the recent differences of one output from the middle of its expected range.
 
-    A middle may be off by half the range. So it is learnt from ranges up to ``2 * change_V`` alone: then the line
-    is off by ``change_V`` at most, and no healthy reading looks like a change. A slow bus leaves wider ranges; with
-    nothing else for ``MEMORY`` readings the line is forgotten.
+    A middle may be off by half the range. So the line is learnt from ranges up to ``2 * change_V`` alone, whose
+    middles are off by ``change_V`` at most. A slow bus leaves wider ranges; after some ``MEMORY`` readings with
+    nothing else the line counts as unknown, and the tolerance alone judges.
     """
 
     def __init__(self, change_V: float) -> None:

@@ -421,7 +421,8 @@ class CompiledMicron(Micron):
             self._show(memory.sinks.page_frame)
         try:
             self.run.scheduler.run_beside(due_ns, first, k, at.STAGES, in_tick=self._is_virtual)
-            next_ns = due_ns + self._daq.dt_ns if self._is_virtual else self.run.clock.now_ns()  # beside no tick waits
+            # in real time no tick waits for what runs beside it
+            next_ns = due_ns + self._daq.dt_ns if self._is_virtual else self.run.clock.now_ns()
             self.run.scheduler.run_slack(next_ns + self.run.period_ns)
         finally:
             self._show(self.stages.frame)
