@@ -37,6 +37,8 @@ I2C_FUNCS, I2C_RDWR, I2C_PEC, I2C_SMBUS = 0x0705, 0x0707, 0x0708, 0x0720
 FUNCTIONS = 0x00000001 | 0x00010000 | 0x00060000 | 0x00180000 | 0x00600000 | 0x0C000000
 QUICK, BYTE, BYTE_DATA, WORD_DATA, I2C_BLOCK_BROKEN, I2C_BLOCK = 0, 1, 2, 3, 6, 8
 MAX_MESSAGES, MAX_LENGTH = 42, 8192
+ANSWER_S = 120.0
+"""Longest time that a transfer may take: a host may stand still, and a test does not fail for that."""
 _HEADER = struct.Struct("<IIQQIIII")
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -209,7 +211,8 @@ def _poke(pid: int, address: int, data: bytes) -> None:
 
 def main(argv: list[str]) -> int:
     try:
-        mounted = FuseI2cFile(UnixI2c(argv[0].removeprefix("unix-i2c://")).transfer, Path(argv[1]))
+        bus = UnixI2c(argv[0].removeprefix("unix-i2c://"), timeout_s=ANSWER_S)
+        mounted = FuseI2cFile(bus.transfer, Path(argv[1]))
     except (OSError, HalError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
