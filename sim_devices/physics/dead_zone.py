@@ -9,6 +9,9 @@ import numpy as np
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import best_starts, thin, value_range
 
+LEAST_BEYOND = 0.05
+"""Least share of the signal's range that lies beyond the zone: without it nothing says that the response comes back."""
+
 
 def _dead_parts(settings: Settings) -> Parts:
     lo, hi = settings.get("range", (-1.0, 1.0))
@@ -39,7 +42,19 @@ def _dead_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("half_width", float(p[0]), "{in}"),
         Human("centre", float(p[1]), "{in}"),
         Human("slope_lost_inside", float(share), "1"),
+        Human("range_beyond", _range_beyond(float(p[0]), float(p[1]), settings), "1"),
     )
+
+
+def _range_beyond(half_width: float, centre: float, settings: Settings) -> float:
+    """Return the share of the signal's range that lies beyond the zone, on the side away from zero.
+
+    A zone about zero is left on either side; of one that is beside zero the far edge must be passed, or it is a limit.
+    """
+    lo, hi = settings.get("range", (-1.0, 1.0))
+    below, above = centre - half_width - lo, hi - centre - half_width
+    beyond = below if centre + half_width < 0.0 else above if centre - half_width > 0.0 else max(below, above)
+    return beyond / (hi - lo)
 
 
 DEAD_ZONE = Effect(
@@ -57,7 +72,7 @@ DEAD_ZONE = Effect(
     basis=lambda x, ctx, q, settings: -np.clip(x - q[1], -q[0], q[0])[:, None],
     report=_dead_report,
     # a slope gained inside makes a limit of it; one that is lost whole scatters about 1
-    limits={"slope_lost_inside": (0.0, 1.1)},
+    limits={"slope_lost_inside": (0.0, 1.1), "range_beyond": (LEAST_BEYOND, 1.0)},
     vanishes_with=(("half_width",), ("slope_lost_inside",)),
     essential=("half_width",),
 )
