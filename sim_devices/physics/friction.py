@@ -321,6 +321,7 @@ def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Hum
         Human("coulomb_forward", float(p[1] + p[2]) / g, "{in}"),
         Human("coulomb_backward", float(p[1] - p[2]) / g, "{in}"),
         Human("static_friction", float(p[1] + p[4]) / g, "{in}"),
+        Human("rise_at_rest", float(p[4]) / g, "{in}"),
         Human("stribeck_speed", float(p[0]), "{out}/s"),
         Human("viscous_difference", 2 * float(p[3]) / g, "{in} s/{out}"),
     )
@@ -349,6 +350,7 @@ def _stribeck_bristle_report(p: Array, settings: Settings, scale: float) -> Sequ
         Human("coulomb_forward", float(p[2]) / g, "{in}"),
         Human("coulomb_backward", float(p[2]) / g, "{in}"),
         Human("static_friction", float(p[2] + p[3]) / g, "{in}"),
+        Human("rise_at_rest", float(p[3]) / g, "{in}"),
         Human("stribeck_speed", float(p[0]), "{out}/s"),
         Human("presliding_distance", float(p[1]), "{out}"),
     )
@@ -368,7 +370,8 @@ _SQUARED = Effect(
     basis=_stribeck_basis,
     fill=_stribeck_fill,
     report=_stribeck_report,
-    vanishes_with=(("static_friction",),),
+    # without a rise it is Coulomb's
+    vanishes_with=(("rise_at_rest",),),
     plain="coulomb_friction",
     # a fall that is wider than all speeds that occur is viscous, and one that is narrower is not seen
     essential=("stribeck_speed",),

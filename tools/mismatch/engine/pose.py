@@ -11,6 +11,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
 from tools.mismatch.engine.hold import infer_holds, with_hold
+from tools.mismatch.engine.imitated import imitated
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.many import levelled, repeated_noise
 from tools.mismatch.engine.noise import noise_floor
@@ -189,7 +190,8 @@ def pose(recording: Recording, held_out: float, seed: int, effects: Iterable[Eff
     if turned:
         recording = with_hold(recording, turned)
         problem, raw, base = prepared(recording, held_out, seed, was_joined)
-    return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, holds)
+    problem = replace(problem, hints=hints, imitated=imitated(problem, base, catalogue))
+    return Posed(recording, catalogue, problem, raw, base, holds)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ class Problem:
     starting points or parameters. ``settle``: the start state of a linear run is fitted to all samples of the fit, as a
     parameter; otherwise it is the engineer's, or the first samples set it. ``afresh``: the start states of every
     stretch, held-out ones too, are fitted to all its samples. ``hints`` are starts from a part of the recording, in
-    addition to those that the whole suggests.
+    addition to those that the whole suggests. ``imitated`` are the labels of places at which an effect is nothing but
+    the twin's own parameters.
     """
 
     recording: Recording
@@ -50,6 +51,7 @@ class Problem:
     settle: bool = False
     afresh: bool = False
     hints: tuple[Hint, ...] = ()
+    imitated: frozenset[str] = frozenset()
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields alone: derived values (and the caches of views) are rebuilt in a worker process."""

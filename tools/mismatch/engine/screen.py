@@ -39,7 +39,8 @@ class Candidate:
 def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, ...]) -> list[Placed]:
     """Return every place that a candidate effect may take beside those present."""
     found = (place for effect in effects for place in sites(problem.twin, problem.recording, effect, present))
-    return [place for place in found if not any(_takes(p, place) for p in present)]
+    free = (place for place in found if place.label not in problem.imitated)
+    return [place for place in free if not any(_takes(p, place) for p in present)]
 
 
 def _takes(present: Placed, place: Placed) -> bool:
