@@ -78,6 +78,44 @@ def test_a_pair_of_which_each_member_gains_little_alone_is_found() -> None:
     assert search.gain_before_prices(best) > 1.5 * alone
 
 
+def cylinder(seed: int) -> Recording:
+    """A hydraulic cylinder in a position loop, by small Euler steps: its valve overlaps, and it goes out faster."""
+    rng = np.random.default_rng(seed)
+    n, dt, steps = 2000, 0.01, 20
+    wanted = np.repeat(rng.uniform(-60.0, 60.0, n // 80), 80)
+    valve, stroke = np.empty(n), np.empty(n)
+    opening = x = 0.0
+    for k in range(n):
+        stroke[k] = x + 0.05 * rng.standard_normal()
+        valve[k] = np.clip(0.12 * (wanted[k] - stroke[k]), -8.0, 8.0)
+        open_to = valve[k] - np.clip(valve[k], -0.4, 0.4)
+        for _ in range(steps):
+            opening += dt / steps * (open_to - opening) / 0.03
+            x += dt / steps * 21.0 * (1.13 if opening > 0.0 else 0.87) * opening
+    twin = {
+        "states": {"opening": "V", "stroke": "mm"},
+        "equations": {"opening": "(valve - opening) / lag", "stroke": "gain * opening"},
+        "lag": 0.032, "gain": 20.0, "hold": "zero",
+    }  # fmt: skip
+    return recording("ode", dt, {"valve": valve}, {"stroke": stroke}, {"valve": "V", "stroke": "mm"}, twin)
+
+
+def test_a_pair_is_found_behind_one_effect_that_imitates_both() -> None:
+    """Friction with two levels leaves a thirtieth, and every set that grows from it keeps it."""
+    problem, _, base = prepared(cylinder(5), 0.3, 0, was_joined=False)
+    effects = [EFFECTS[n] for n in ("coulomb_friction", "dead_zone", "direction_dependence")]
+    search = Search(problem, base, effects, learned())
+    with np.errstate(all="ignore"):
+        search.expand(search.store.base)
+        assert search.store.ranked()[0].names == {"coulomb_friction"}
+        search.run()
+    best = search.store.ranked()[0]
+    assert {(p.effect.name, p.target) for p in best.placed} == {
+        ("dead_zone", "valve"),
+        ("direction_dependence", "gain by direction of stroke"),
+    }
+
+
 def folded(power: float, seed: int) -> Recording:
     """A reader of the magnitude behind a damped oscillator, which is integrated by small steps."""
     rng = np.random.default_rng(seed)

@@ -79,12 +79,13 @@ class Search:
         self.store.listen(self.store.ranked()[0])
         self.pair()
         self.grow()
+        self.moves = max(self.moves, 1)  # for an account without the first name of the best one
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
             if len(best.names) < 2 or not self.can_be_beaten(best):
                 break
-            rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in sorted(best.names)]
-            for rest in rests:
+            for name in sorted(best.names):
+                rest = self.best_without(best, name)
                 if rest.key not in self.expanded and self.moves:
                     self.moves -= 1
                     self.expand(rest)
@@ -96,6 +97,11 @@ class Search:
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
+
+    def best_without(self, best: Scored, name: str) -> Scored:
+        """Return the best set without ``name``: a beam of sets that share their first name grows no other account."""
+        self.store.without(best, lambda p: p.effect.name == name)
+        return next(s for s in self.store.ranked() if name not in s.names)
 
     def combine(self) -> None:
         """Join the best single effects of the outputs, the best first, while the score grows.

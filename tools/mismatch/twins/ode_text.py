@@ -288,17 +288,21 @@ def _directions(
 ) -> list[tuple[int, int]]:
     """Return (parameter, state): each parameter of a derivative, with the state whose direction it may differ with.
 
-    That is the state itself, or of a velocity its position.
+    That is the state itself, or of a velocity its position. A position may have a parameter of its own: the gain of a
+    valve, where its opening counts as the velocity.
     """
     at = np.linspace(0, x.shape[0] - 1, PROBES).astype(int)
     as_given = rates_at(equations, x[at], u[at], values)
+    acted_on = [p for p in places if p.kind in ("motion", "storage")]
+    follows = {**{j: [j] for j in range(x.shape[1])}, **{p.target: list[int]() for p in acted_on}}
+    for p in acted_on:
+        follows[p.target].append(p.position)
     out: list[tuple[int, int]] = []
     for i in free:
         changed = values.copy()
         changed[i] = values[i] * 1.01 if values[i] else 1e-3
         differs = np.any(rates_at(equations, x[at], u[at], changed) != as_given, axis=0)
-        of = [p.position for p in places if p.kind in ("motion", "storage") and differs[p.target]]
-        out += [(i, j) for j in dict.fromkeys(of)]
+        out += [(i, j) for j in dict.fromkeys(j for k, of in follows.items() if differs[k] for j in of)]
     return out
 
 
