@@ -274,18 +274,20 @@ KNOWN_WITHIN = 1.25
 """Factor, either way, within which a floor from periods, rest or a flat spectrum counts as known."""
 
 
-def floor_interval(floor: NoiseFloor, left: Array, follows: float, rate_hz: float) -> tuple[float, float]:
+def floor_interval(
+    floor: NoiseFloor, left: Array, follows: float, rate_hz: float, *, of_any_colour: bool = False
+) -> tuple[float, float]:
     """Return the interval of the noise rms.
 
     ``left`` (m,) is the residual of the final model, ``follows`` the share of its variance that recorded signals
-    predict; the rest is the upper bound of the noise.
+    predict; the rest is the upper bound of noise that falls up to the end of the spectrum, or ``of_any_colour``.
     """
     if floor.declared:
         return floor.rms, floor.rms
     if floor.method != "spectrum":
         return floor.rms / KNOWN_WITHIN, max(floor.rms * KNOWN_WITHIN, min(floor.most, 2 * floor.rms))
     _, _, falling = spectral_floor(left, rate_hz)
-    if not falling:
+    if not falling and not of_any_colour:
         return floor.rms, KNOWN_WITHIN * floor.rms
     unpredicted = float(np.sqrt(np.mean(left**2) * max(1.0 - follows, 0.0)))
     return floor.rms, max(min(unpredicted, floor.most), floor.rms)

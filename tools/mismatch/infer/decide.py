@@ -241,11 +241,11 @@ class Rest:
     floors: Mapping[str, tuple[float, float]]
 
 
-def rest_of(problem: Problem, fitted: Fit) -> Rest:
+def rest_of(problem: Problem, fitted: Fit, *, of_any_colour: bool = False) -> Rest:
     """Return the rest of a model.
 
-    The rest is real if it follows a signal or if it is louder than the noise can be. Readings on a lattice are as loud
-    as its rounding, because beside an edge the side is unknown.
+    The rest is real if it follows a signal or if it is louder than the noise can be, which may be noise
+    ``of_any_colour``. Readings on a lattice are as loud as its rounding, because beside an edge the side is unknown.
     """
     rest = unpredicted(problem, fitted)
     left: dict[str, Leftover] = {}
@@ -254,7 +254,9 @@ def rest_of(problem: Problem, fitted: Fit) -> Rest:
         v = leftover(problem, rest, o)
         follows = max((d.strength for d in v.follows), default=0.0) if v.real else 0.0
         held = rest.residual[o][problem.held_rows]
-        low, most = floor_interval(problem.floors[o], held, follows, 1 / problem.recording.dt)
+        low, most = floor_interval(
+            problem.floors[o], held, follows, 1 / problem.recording.dt, of_any_colour=of_any_colour
+        )  # fmt: skip
         most = max(most, problem.floors[o].step / math.sqrt(12.0))
         left[o] = replace(v, real=v.real or v.ratio * problem.sigma(o) ** 2 > LOUD * most**2)
         floors[o] = low, most
@@ -368,6 +370,12 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
     rest = rest_of(p, final.fitted)
     left, most_left = (worst_left(p, store.base.fitted, rest, doubt=doubt) for doubt in (False, True))
     quiet, loud = is_whole(*left, c), is_whole(*most_left, c)
+    if not final.placed and not quiet and strange is None:
+        # what follows nothing that was recorded, and no effect explains, may be noise of any colour
+        coloured = rest_of(p, final.fitted, of_any_colour=True)
+        if is_whole(*worst_left(p, store.base.fitted, coloured, doubt=False), c):
+            loudest = tuple(o for o, (_, hi) in coloured.floors.items() if hi > rest.floors[o][1])
+            return Judged(final, coloured, True, loudest, False)
     # without a named effect the noise as estimated decides, so that the doubt is reported
     whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()

@@ -17,7 +17,7 @@ from tools.mismatch.engine.assemble import conclude
 from tools.mismatch.engine.hold import with_hold
 from tools.mismatch.engine.identifiability import LeastNamed, experiment
 from tools.mismatch.engine.pose import Ended, Posed, pose, run_through
-from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
+from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed, Verdict
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.borne_out import doubts_of
@@ -173,7 +173,8 @@ def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
         # corrected for the number of screened candidates (Bonferroni)
         p = min(1.0, float(norm.sf(store.least_z(answer.chosen))) * max(len(store.seen), 1))
         return Decision("missing_physics", p, "", (), floors, answer.doubtful)
-    return Decision("recalibrate" if recalibrated(store, raw) else "agrees", 1.0, "", (), floors)
+    nothing_missing: Verdict = "recalibrate" if recalibrated(store, raw) else "agrees"
+    return Decision(nothing_missing, 1.0, "", (), floors, answer.doubtful)
 
 
 def least_p(left: Iterable[object]) -> float:
