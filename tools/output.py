@@ -8,8 +8,10 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -123,12 +125,66 @@ def check_names(*destinations: str | Path | None) -> None:
             raise InputError(f"{destination}: looks like an option; name a file, or ./{destination} for that name")
 
 
-def check_writable(*destinations: str | Path | None, folders: bool = False) -> None:
-    """Refuse, before any work, a result file that cannot be written: ``InputError``.
+MOST_FILES = 1000
+"""Number of descriptions (.toml) below a folder that are looked at for the files that they name."""
+
+
+def files_read(path: Path) -> set[Path]:
+    """Return the files behind an input: the file itself, and what it names if it is a description (.toml).
+
+    A folder stands for its recording.toml, or for every description below it.
+    """
+    own = path / "recording.toml"
+    todo = [path] if not path.is_dir() else [own] if own.is_file() else list(islice(path.rglob("*.toml"), MOST_FILES))
+    found: set[Path] = set()
+    while todo:
+        file = todo.pop().resolve()
+        if file in found or not os.path.isfile(file):  # False, too, for a text that can be no name of a file
+            continue
+        found.add(file)
+        if file.suffix.lower() == ".toml":
+            todo += [file.parent / name for text in _texts(_table(file)) for name in (text, text.rpartition(":")[0])]
+    return found
+
+
+def _table(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}  # the command that reads it says what is wrong
+
+
+def _texts(value: object) -> Iterator[str]:
+    if isinstance(value, str):
+        if value and "\0" not in value:
+            yield value
+    elif isinstance(value, Mapping | list):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(inner)
+
+
+def _is_recording(target: Path) -> bool:
+    """Return True for a recording of the instrument, and for the recording.toml of a folder with the files it names."""
+    beside = target.parent / "recording.toml"
+    return target.is_file() and (target.suffix.lower() == ".mcap" or target in files_read(beside))
+
+
+def check_writable(
+    *destinations: str | Path | None,
+    folders: bool = False,
+    reads: Sequence[str | Path | None] = (),
+    overwrite: bool = False,
+) -> None:
+    """Refuse, before any work, a result file that cannot be written or would replace data: ``InputError``.
 
     The folder must be there and take a file, and the name must not be a folder's (unless ``folders``). A name that
     begins with ``-`` is an option in the wrong place. That the disk becomes full during the work is not seen here.
+    No result replaces another one, a file behind the inputs ``reads``, or (unless ``overwrite``) another recording.
     """
+    inputs: set[Path] = set()
+    for path in reads:
+        inputs |= set() if path is None else files_read(Path(path))
+    targets: set[Path] = set()
     for destination in destinations:
         if destination is None or str(destination) == "-":
             continue
@@ -144,6 +200,13 @@ def check_writable(*destinations: str | Path | None, folders: bool = False) -> N
             if not target.is_dir() and not os.access(target, os.W_OK):
                 raise InputError(f"{destination}: no permission to write there; name another file")
             continue
+        if target in targets:
+            raise InputError(f"{destination}: is named for two results; name a file for each")
+        targets.add(target)
+        if target in inputs:
+            raise InputError(f"{destination}: is read by this command and would be overwritten; name another file")
+        if not overwrite and _is_recording(target):
+            raise InputError(f"{destination}: is a recording or its data and would be overwritten; name another file")
         try:
             with tempfile.TemporaryFile(dir=parent, prefix=f".{target.name[:200]}."):
                 pass
@@ -151,15 +214,22 @@ def check_writable(*destinations: str | Path | None, folders: bool = False) -> N
             raise InputError(_cannot(destination, error)) from error
 
 
-def check_folder(folder: Path | None, option: str = "--out") -> None:
-    """Refuse, before any work, a folder for results that is a file or cannot be written: ``InputError``."""
+def check_folder(
+    folder: Path | None, option: str = "--out", *, files: Sequence[str] = (), reads: Sequence[str | Path | None] = ()
+) -> None:
+    """Refuse, before any work, a folder for results that is a file or cannot be written: ``InputError``.
+
+    ``files``: what will be written into it; none of them may be data (``check_writable``).
+    """
     if folder is None:
         return
-    check_writable(folder, folders=True)
+    check_writable(folder, folders=True, overwrite=True)  # a file is refused below
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{option} {folder}: is a file; name a folder")
     if folder.exists() and not os.access(folder, os.W_OK):
         raise InputError(f"{option} {folder}: you may not write there; name another folder, or change its rights")
+    if folder.is_dir():
+        check_writable(*(folder / name for name in files), reads=reads)
 
 
 def _cannot(path: object, error: OSError) -> str:

@@ -42,7 +42,7 @@ def sensors(
     from tools.calibrate.tumble import SENSORS, identify, load_tumble
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         result = identify(load_tumble(recording), quadratic=model is Model.COMPOSITE, fit_drift=drift is OnDrift.FIT)
         made_by = f"micron calibrate sensors {recording}"
         save_calibration(out, "sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
@@ -101,7 +101,7 @@ def gyroscope(
     from tools.calibrate.logs import load_log
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         log = load_log(recording, rate_hz)
         force, rate = log.matrix(three(accelerometer_columns)), log.matrix(three(columns))
         result = fit_gyroscope(force, rate, log.need_rate(), gravity, shortest_s)
@@ -151,7 +151,7 @@ def positions(
     from tools.calibrate.positions import fit_positions
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         config = bench_sensing(bench_path(bench))
         log = load_log(recording, rate_hz)
         readings, field = instrument_readings(log, config)

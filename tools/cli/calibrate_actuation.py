@@ -55,7 +55,7 @@ def piezo(
     from tools.mismatch.recording_load import load
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=recordings)
         groups = [recordings_of(path) for path in recordings]
         if together:
             groups = [[path for group in groups for path in group]]
@@ -158,7 +158,7 @@ def manipulator(
     from tools.calibrate.manipulator import identify_manipulator, load_scan, manipulator_calibration
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         fit = identify_manipulator(load_scan(recording))
         write_calibration(out, manipulator_calibration(fit, f"manipulator from {recording.name}"))
         title = f"{fit.positions} positions, condition {fit.condition:.0f}"

@@ -105,7 +105,7 @@ def accelerometer(
     from tools.calibrate.still import remove_drift
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         if method is Method.STAGE:
             _stage(recording, three(columns), model, drift, rate_hz=rate_hz, out=out, json_file=json_file)
             return
@@ -203,7 +203,7 @@ def magnetometer(
     from tools.calibrate.logs import load_log
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[recording])
         log = load_log(recording, 1.0)
         raw, offset = log.matrix(three(columns)), None
         if reset_columns is not None:

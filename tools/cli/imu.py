@@ -69,7 +69,7 @@ def imu(
     from tools.imu.series import Scales, load_series
 
     with clear_errors():
-        check_writable(json_file, picture)
+        check_writable(json_file, picture, reads=[*(recording or ()), *(fall or ()), turned, bench])
         if (bench is None) == (not recording and not fall and turned is None):
             raise InputError("give recordings, or --bench FILE to measure: one of the two")
         if picture is not None and bench is None and not recording:

@@ -81,7 +81,7 @@ def diagnose(
     Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
     """
     with clear_errors():
-        check_writable(json_file, html)
+        check_writable(json_file, html, reads=recordings)
         check_folder(out)
         processes = jobs or os.cpu_count() or 1
         if together:
@@ -223,7 +223,7 @@ def new(
     """
     with clear_errors():
         check_names(out)
-        check_writable(json_file)
+        check_writable(json_file, reads=[data])
         for option, hertz in (("--rate", rate), ("--resample", resample)):
             if hertz is not None and not 0.0 < hertz < 1e9:
                 raise InputError(f"{option} {hertz:g}: must be a number of samples per second")
@@ -339,7 +339,7 @@ def apply(
             raise InputError(f"--bench takes a twin file; name one that ends in .toml with --out, not {out.name}")
         copy = bench_out or out.with_name("bench.toml")
         decide_on([recording], trust, allow_outside)
-        check_writable(out, *([] if bench is None else [copy]))
+        check_writable(out, *([] if bench is None else [copy]), reads=[recording, report, bench])
         original = None
         if bench is not None:
             from hal.bench import load_bench
@@ -391,7 +391,7 @@ def simulate(
     The recording's own twin, and what was read of the recording: micron mismatch simulate rec
     """
     with clear_errors():
-        check_writable(out, json_file)
+        check_writable(out, json_file, reads=[twin, recording])
         decide_on([twin, recording or twin], trust, allow_outside)
         from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
         from tools.mismatch.export.write import columns

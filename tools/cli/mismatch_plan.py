@@ -70,7 +70,7 @@ def plan(
     Example: micron mismatch plan recordings/stack
     """
     with clear_errors():
-        check_writable(json_file)
+        check_writable(json_file, reads=[twin, report])
         check_folder(out)
         for name, value in (("--out", out), ("--stack", stack or None)):
             if value is not None and report is None:
@@ -83,6 +83,9 @@ def plan(
         from hal.bench import load_bench
         from tools.mismatch.plan import plan as planning
         from tools.mismatch.plan.limits import Wish, bench_limits, parse_band
+        from tools.mismatch.plan.write import FILES
+
+        check_folder(out, files=FILES, reads=[twin, report])
 
         limits = None if bench is None else bench_limits(load_bench(bench_path(bench)))
         wish = Wish(amplitude, centre, rate, parse_band(band), duration, rms)

@@ -50,7 +50,7 @@ def watch(
     Example: micron mismatch watch twin.toml rec --reference 60
     """
     with clear_errors():
-        check_writable(json_file)
+        check_writable(json_file, reads=[twin, recording])
         check_rate(false_alarms_per_hour)
         decide_on([twin, recording], trust, allow_outside)
         from tools.mismatch.watch.offline import lines, watch_recording

@@ -59,7 +59,7 @@ def noise(
 
     with clear_errors():
         check_names(image)
-        check_writable(json_file)
+        check_writable(json_file, reads=[recording, bench])
         log = load_log(recording, rate_hz)
         if bench is not None:
             log = calibrated_log(log, bench_path(bench))

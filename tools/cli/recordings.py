@@ -32,7 +32,7 @@ def recover(
     Example: micron recover out/run.mcap
     """
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file, out, reads=[file], overwrite=overwrite)
         report = recover_recording(file, out or file.with_suffix(".recovered.mcap"), overwrite=overwrite)
         for line in report.lines():
             console().print(line, soft_wrap=True)
@@ -67,7 +67,7 @@ def export(
     with clear_errors():
         check_writable(json_file)
         out = _target(to, out, raw)
-        check_writable(out, folders=True)
+        check_writable(json_file, out, folders=True, reads=[file], overwrite=overwrite)
         recording = Recording(file)
         with tempfile.TemporaryDirectory(prefix="micron-") as scratch:
             if from_s is not None or to_s is not None or raw:

@@ -36,7 +36,7 @@ def replay(
     from firmware_py.replay import replay_recording
 
     with clear_errors():
-        check_writable(json_file)
+        check_writable(json_file, reads=[recording])
         opened = Recording(recording)
         started_s = time.perf_counter()
         report = replay_recording(opened)

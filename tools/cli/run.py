@@ -112,7 +112,7 @@ def run(
     """
     with clear_errors():
         check_names(image)
-        check_writable(json_file, html, record)
+        check_writable(json_file, html, record, reads=[bench, hand, manual, watch])
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
         if max_effect is not None and not inject and manual is None:

@@ -46,7 +46,7 @@ def simulate_command(
 
     delay_s = COMMAND_DELAY_S if delay_us is None else 1e-6 * delay_us
     with clear_errors():
-        check_writable(json_file, image)
+        check_writable(json_file, image, reads=[bench, hand])
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
         file = bench_path(bench)

@@ -19,6 +19,9 @@ from tools.mismatch.recording_load import MIN_SAMPLES, descriptor
 from tools.mismatch.recording_ranges import MIN_SPAN
 from tools.toml_text import toml_text
 
+DESCRIPTOR, DATA = "recording.toml", "data.npz"
+"""Files of the recording that a cut writes."""
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -52,6 +55,9 @@ def cut(
     path = path / "recording.toml" if path.is_dir() else path
     if out.resolve() == path.resolve().parent:
         raise InputError(f"{out}: holds the recording itself, and a cut would replace its data; name another folder")
+    existing = [str(out / name) for name in (DATA, DESCRIPTOR) if (out / name).exists()]
+    if existing:
+        raise InputError(f"{', '.join(existing)}: is there already; name another folder")
     text = descriptor(path)
     channels = [c for c in text.get("channels", []) if isinstance(c, dict)]
     names = [str(c["column"]) for c in channels if "column" in c]
@@ -183,7 +189,7 @@ def _write(
     """Write the descriptor and its data, without a split in samples, which is no longer valid."""
     out.mkdir(parents=True, exist_ok=True)
     head = {k: v for k, v in text.items() if k not in ("time_column", "split", "segments")}
-    head |= {"data": "data.npz", "rate_hz": rate_hz}
+    head |= {"data": DATA, "rate_hz": rate_hz}
     if segments:
         head["segments"] = segments
     twin = head.get("twin")
@@ -191,5 +197,5 @@ def _write(
         file = path_inside(path, twin["file"])
         allow_name(file)  # the new folder names it where it is
         head["twin"] = {"file": os.path.relpath(file, out.resolve())}
-    np.savez(out / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
-    (out / "recording.toml").write_text(toml_text(head), encoding="utf-8")
+    np.savez(out / DATA, **columns)  # pyright: ignore[reportArgumentType]
+    (out / DESCRIPTOR).write_text(toml_text(head), encoding="utf-8")

@@ -140,7 +140,7 @@ def _targets(data: Path, out: Path, rewrites: bool, force: bool) -> list[Path]:
         )
     if any(p.resolve() == data.resolve() for p in targets):
         raise InputError(f"{data}: would be overwritten; name another file with --out")
-    check_writable(*targets)
+    check_writable(*targets, overwrite=True)  # what is there was agreed to with --force
     return targets
 
 

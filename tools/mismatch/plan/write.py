@@ -19,6 +19,7 @@ from tools.mismatch.twins.make import make
 from tools.output import save_figure, write_bytes_atomic, write_text_atomic
 
 CSV, NPZ, PROGRAM, PICTURE = "input.csv", "input.npz", "program.toml", "plan.png"
+FILES = (CSV, NPZ, PROGRAM, PICTURE)
 PROGRAM_RATE_HZ = 1000.0
 """Rate of a program of the bench, which is its tick rate. A plan at another rate is interpolated linearly."""
 
