@@ -35,7 +35,10 @@ HandOption = Annotated[
 ScaleOption = Annotated[
     float | None,
     typer.Option(
-        "--scale", help="With --hand: factor on its motion; by default its tremor (8-12 Hz) becomes 50 um p-p."
+        "--scale",
+        min=1e-6,
+        max=1e3,
+        help="With --hand: factor on its motion; by default its tremor (8-12 Hz) becomes 50 um p-p.",
     ),
 ]
 SeedOption = Annotated[

@@ -12,6 +12,7 @@ import os
 import sys
 from importlib import import_module
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -102,7 +103,7 @@ def load(name: str) -> Any:
         around.add_typer(target, name=name, cls=Helpful)
     else:
         around.command(name)(target)
-    return _with_brackets(typer.main.get_group(around).commands[name])
+    return _with_finite_numbers(_with_brackets(typer.main.get_group(around).commands[name]))
 
 
 def _with_brackets(command: Any) -> Any:
@@ -115,6 +116,25 @@ def _with_brackets(command: Any) -> Any:
             parameter.help = escape(parameter.help)
     for inner in getattr(command, "commands", {}).values():
         _with_brackets(inner)
+    return command
+
+
+def _with_finite_numbers(command: Any) -> Any:
+    """Let ``command`` refuse options that are nan or infinite, and return it: nan passes the ranges of typer."""
+    invoke = command.invoke
+
+    def checked(ctx: Any) -> Any:
+        for parameter in command.params:
+            value = ctx.params.get(parameter.name)
+            for number in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(number, float) and not isfinite(number):
+                    typer.echo(f"micron: {parameter.opts[0]} {number}: is no finite number; give one", err=True)
+                    ctx.exit(Exit.BAD_INPUT)
+        return invoke(ctx)
+
+    command.invoke = checked
+    for inner in getattr(command, "commands", {}).values():
+        _with_finite_numbers(inner)
     return command
 
 
