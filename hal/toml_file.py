@@ -27,7 +27,7 @@ def read_text(path: Path, advice: str) -> str:
             data = file.read(LARGEST_BYTES + 1)
         if len(data) > LARGEST_BYTES:
             raise BenchError(f"{path}: cannot be read (longer than {LARGEST_BYTES} bytes); {advice}")
-        return data.decode("utf-8")
+        return data.decode("utf-8-sig")
     except (OSError, ValueError) as error:  # ValueError: no UTF-8, or a zero byte in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise BenchError(f"{str(path)!r}: cannot be read ({why}); {advice}") from error

@@ -149,7 +149,7 @@ def files_read(path: Path) -> set[Path]:
 
 def _table(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError):
         return {}  # the command that reads it says what is wrong
 

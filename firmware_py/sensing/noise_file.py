@@ -60,7 +60,7 @@ def noise_table(path: Path, config: SensingConfig) -> dict[str, Any]:
     Raises ``BenchError`` naming the file and what is wrong with it.
     """
     try:
-        found = _NoiseFile.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        found = _NoiseFile.model_validate(json.loads(path.read_text(encoding="utf-8-sig")))
     except OSError as error:
         raise BenchError(f"{path}: noise file cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:

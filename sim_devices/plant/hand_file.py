@@ -130,7 +130,7 @@ def _read_npz(path: Path) -> dict[str, Array]:
 
 def _read_csv(path: Path) -> dict[str, Array]:
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except FileNotFoundError:
         raise HandFileError(f"{path} does not exist") from None
@@ -152,7 +152,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
 
 def _toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise HandFileError(f"{path} does not exist") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -193,7 +193,7 @@ def _choose(path: Path, columns: dict[str, Array], name: str) -> dict[str, Array
     names = {str(i): int(i) for i in np.unique(ids)}
     index = path.parent / "index.csv"
     if index.exists():
-        with index.open(newline="") as file:
+        with index.open(newline="", encoding="utf-8-sig") as file:
             names |= {r["name"]: int(r["recording_id"]) for r in csv.DictReader(file)}
     if name not in names:
         known = ", ".join(n for n in names if not n.isdigit()) or ", ".join(names)

@@ -280,7 +280,7 @@ def load_config(bench: Path | None, unit: int | None) -> EmulationConfig:
     table: dict[str, object] = {}
     if bench is not None:
         try:
-            table = dict(tomllib.loads(bench.read_text()).get("emulation", {}))
+            table = dict(tomllib.loads(bench.read_text(encoding="utf-8-sig")).get("emulation", {}))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise LabError(f"{bench}: {error}") from error
     if unit is not None:

@@ -20,7 +20,7 @@ from tools.terminal import task_name
 def read_report(path: Path) -> dict[str, Any]:
     """Return the JSON that ``diagnose --json`` wrote. Raises InputError for anything else."""
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
+        body = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give what diagnose --json wrote") from error
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -93,7 +93,7 @@ def find(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*.toml")):
         try:
-            if "channels" not in tomllib.loads(path.read_text(encoding="utf-8")):
+            if "channels" not in tomllib.loads(path.read_text(encoding="utf-8-sig")):
                 continue
         except (tomllib.TOMLDecodeError, UnicodeDecodeError):
             pass

@@ -176,11 +176,11 @@ def _toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording; give a folder with recording.toml or a .toml file")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
         raise RecordingError(f"{path}: not valid TOML: {error}") from None
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: not UTF-8 text ({error.reason})") from None
+        raise RecordingError(f"{path}: not UTF-8 text ({error.reason}); save it as UTF-8") from None
 
 
 def _twin_table(path: Path, value: object) -> object:

@@ -136,7 +136,7 @@ def in_file_units(recording: Recording) -> dict[str, Array]:
 
 def _run_module(path: Path, recording: Recording) -> dict[str, Array]:
     """Return the outputs of ``simulate`` of a Python twin, run in a process of its own."""
-    source = trusted_program(path, path).decode("utf-8", "replace")
+    source = trusted_program(path, path).decode("utf-8-sig", "replace")
     opening = {"ask": "open_module", "path": str(path), "source": source, "dt": recording.dt}
     guest = GuestProcess(str(path), opening)
     try:

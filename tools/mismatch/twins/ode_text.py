@@ -442,7 +442,7 @@ def _traced(
     path = path_inside(recording.path, file)
     if not path.is_file():
         raise EquationError(f"function: {path} does not exist")
-    source = trusted_program(path, recording.path).decode("utf-8", "replace")
+    source = trusted_program(path, recording.path).decode("utf-8-sig", "replace")
     request = {"ask": "trace", "path": str(path), "source": source, "attribute": attribute}
     guest = GuestProcess(str(path), {**request, "names": names, "groups": groups})
     try:
