@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from typing import TypeGuard
+
 import numpy as np
 from numpy.typing import NDArray
+
+
+def is_finite_number(value: object) -> TypeGuard[int | float]:
+    """Return True for a number that a float can hold: no truth value, no nan, no integer of hundreds of digits."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def rms(values: NDArray[np.float64]) -> float:

@@ -19,6 +19,7 @@ from scipy.stats import t as student
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.manipulator import star_tip
+from hal.npz import open_npz
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.multi_position import Estimate
 from tools.errors import InputError
@@ -49,7 +50,7 @@ def load_scan(folder: Path) -> dict[str, Array]:
     """``stroke_um`` and ``tip_um``, both (n, 3), of a scan recording. ``InputError`` says what is wrong."""
     path = folder / "data.npz" if folder.is_dir() else folder
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open_npz(path) as archive:
             data = {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
     except (OSError, ValueError) as error:
         raise InputError(

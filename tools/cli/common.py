@@ -98,6 +98,11 @@ def clear_errors() -> Iterator[None]:
             raise typer.Exit(Exit.BAD_INPUT) from error
         except HalError as error:
             _fail(error, exit_code_of(error))
+        except OSError as error:
+            if error.filename is None:
+                raise  # no file of a person; a reader of the pipe that went away, for one
+            print_error(f"{error.filename}: cannot be used ({error.strerror}); name another file, or change its rights")
+            raise typer.Exit(Exit.BAD_INPUT) from error
         except MemoryError as error:
             print_error(
                 f"not enough memory: {error or 'nothing more could be allocated'}; end other programs, or ask for less"

@@ -113,7 +113,8 @@ def check_outputs(recording: Recording, report: Mapping[str, Any]) -> None:
             " give the report of this recording"
         )
     fit = report["fit"]
-    outputs = set(fit.get("unit", {})) if isinstance(fit, Mapping) else set[str]()
+    unit = fit.get("unit") if isinstance(fit, Mapping) else None
+    outputs = set(unit) if isinstance(unit, Mapping) else set[str]()
     if outputs != set(recording.outputs):
         reported, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
         raise InputError(
@@ -138,12 +139,18 @@ def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, 
     A twin that is written and read again may have other state coordinates and hence another gain; the effect must stay
     the same.
     """
-    shifts = {b["name"]: float(b["with_effects"]) for b in report["fit"].get("base_parameters", [])}
+    try:
+        shifts = {str(b["name"]): float(b["with_effects"]) for b in report["fit"].get("base_parameters", [])}
+        exported = [float(v) for v in report.get("corrected_parameters") or ()]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"the report was changed by hand: a figure of its parameters is missing or no number ({error!r});"
+            " run diagnose --json again"
+        ) from None
     old = make(recording)
     if set(shifts) != {p.name for p in old.parameters}:
         return theta
-    exported = report.get("corrected_parameters") or [shifts[p.name] for p in old.parameters]
-    fitted = np.array([float(v) for v in exported])
+    fitted = np.array(exported or [shifts[p.name] for p in old.parameters])
     theta = theta.copy()
     for k, placed in enumerate(model.placed):
         if placed.site == "output":

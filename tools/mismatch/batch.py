@@ -95,7 +95,7 @@ def find(folder: Path) -> dict[str, Path]:
         try:
             if "channels" not in tomllib.loads(path.read_text(encoding="utf-8-sig")):
                 continue
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        except (OSError, ValueError, RecursionError):  # no TOML, no UTF-8, or no file that may be read
             pass
         name = path.relative_to(folder).with_suffix("")
         found[str(name.parent if name.name == "recording" else name)] = path

@@ -13,6 +13,7 @@ from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Array
 from tools.mismatch.twins.vocabulary import Role, Vocabulary
+from tools.numbers import is_finite_number
 
 MOST_SIZE = 1e100  # of any value: squares must stay finite
 KEYS = {"column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance"}
@@ -177,6 +178,6 @@ def refuse_equal_columns(path: Path, channels: list[Channel], columns: Mapping[s
 def finite_number(where: str, key: str, value: object) -> float | None:
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if not is_finite_number(value):
         raise RecordingError(f"{where}: {key} must be a finite number, got {value!r}")
     return float(value)

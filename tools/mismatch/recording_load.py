@@ -175,12 +175,16 @@ def descriptor(path: Path) -> dict[str, Any]:
 def _toml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording; give a folder with recording.toml or a .toml file")
+    is_data = path.suffix.lower() in SUFFIXES
+    advice = f"; 'micron mismatch new {path}' describes a data file in a recording.toml" if is_data else ""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except tomllib.TOMLDecodeError as error:
-        raise RecordingError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}); give a file that you may read") from None
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: not UTF-8 text ({error.reason}); save it as UTF-8") from None
+        raise RecordingError(f"{path}: not UTF-8 text ({error.reason}){advice or '; save it as UTF-8'}") from None
+    except (ValueError, RecursionError) as error:  # of tomllib; numbers of thousands of digits; tables too deep
+        raise RecordingError(f"{path}: not valid TOML: {error}{advice}") from None
 
 
 def _twin_table(path: Path, value: object) -> object:

@@ -13,6 +13,7 @@ from hal.trust import path_inside
 from tools.errors import RecordingError
 from tools.mismatch.recording import Condition, Split
 from tools.mismatch.recording_clock import CUT
+from tools.numbers import is_finite_number
 
 MIN_SPAN = 30  # least samples of a run, and of a [split] range
 APART = ("state_space", "mechanical_axis", "ode", "piezo_stack", "accelerometer", "magnetometer")
@@ -66,7 +67,7 @@ def read_conditions(where: str, value: object) -> dict[str, Condition]:
             found[key] = (full if full.tzinfo else full.replace(tzinfo=UTC)).timestamp() / 86400.0
         elif isinstance(item, str):
             found[key] = item
-        elif isinstance(item, int | float) and not isinstance(item, bool) and np.isfinite(item):
+        elif is_finite_number(item):
             found[key] = float(item)
         else:
             raise RecordingError(f"{where}: [conditions] {key} must be a number, a text or a date, got {item!r}")

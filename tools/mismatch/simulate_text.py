@@ -16,6 +16,8 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import between_of
 from tools.mismatch.twins.core import core
+from tools.mismatch.twins.feedback import FASTEST
+from tools.numbers import is_finite_number
 
 
 def describe(model: Model, theta: Array) -> dict[str, Any]:
@@ -82,10 +84,13 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
         settings = {k: tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
     except (TypeError, ValueError):
         raise RecordingError(f"{where}: settings must be lists of numbers") from None
+    fastest = settings.get(FASTEST, (0.0,))
+    if not np.all(np.isfinite([x for v in settings.values() for x in v])) or not fastest or fastest[0] < 0.0:
+        raise RecordingError(f"{where}: settings must be finite numbers, and {FASTEST} one that is not negative")
     effect = _variant(where, effect, site, settings, given, entry.get("equation"))
     pl = Placed(effect, site, target, cast(Stage, stage), tuple(outputs), settings)
     names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
-    missing = [n for n in names if not _finite(given.get(n))]
+    missing = [n for n in names if not is_finite_number(given.get(n))]
     if missing:
         raise RecordingError(f"{where}: parameters {', '.join(missing[:5])} missing or not finite numbers")
     return pl, np.array([float(given[n]) for n in names])
@@ -109,7 +114,3 @@ def _variant(
         e for e, p in zip(forms, parts, strict=True) if {q.name for q in (*p.nonlinear, *p.weights)} == set(given)
     ]
     return fitting[0] if fitting else forms[0]
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

@@ -13,6 +13,7 @@ from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.holds import holds_text, read_holds
+from tools.numbers import is_finite_number
 
 _NAMES = names(PARAMETERS["mechanical_axis"])
 
@@ -100,7 +101,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
 def _number(recording: Recording, key: str, value: object) -> float | None:
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if not is_finite_number(value):
         raise RecordingError(f"{recording.path}: [twin.parameters] {key} must be a finite number, got {value!r}")
     return float(value)
 

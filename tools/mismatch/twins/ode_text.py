@@ -23,6 +23,7 @@ from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.program import parse
+from tools.numbers import is_finite_number
 
 TABLES = ("states", "equations", "outputs", "offsets", "units", "function", "fixed", "hold")
 """Keys of an ode twin that are not numbers; they stand beside ``parameters`` in ``[twin]``, or inside it."""
@@ -35,7 +36,7 @@ def ode_twin(recording: Recording) -> OdeTwin:
     """Build the twin that a recording's table describes. Raises RecordingError that names the key and the remedy."""
     table = recording.twin.parameters
     where = f"{recording.path}: [twin]"
-    unknown = [k for k, v in table.items() if k not in TABLES and not _number(v)]
+    unknown = [k for k, v in table.items() if k not in TABLES and not is_finite_number(v)]
     if unknown:
         raise RecordingError(
             f"{where} {unknown[0]} = {table[unknown[0]]!r} is neither a finite number nor one of {', '.join(TABLES)}"
@@ -66,7 +67,7 @@ def _offsets(where: str, recording: Recording, table: Mapping[str, Any], others:
     """
     own = [o for o in recording.outputs if offset_name(o) not in others]
     given = table.get("offsets", {})
-    if not isinstance(given, Mapping) or any(o not in own or not _number(v) for o, v in given.items()):
+    if not isinstance(given, Mapping) or any(o not in own or not is_finite_number(v) for o, v in given.items()):
         raise RecordingError(f"{where} offsets must give a number for an output ({', '.join(own)}), got {given!r}")
     return {offset_name(o): float(given.get(o, 0.0)) for o in own}
 
@@ -358,7 +359,7 @@ def _states(where: str, table: object) -> tuple[State, ...]:
         if not isinstance(entry, Mapping) or set(entry) - known or not isinstance(entry.get("unit", "1"), str):
             raise RecordingError(f"{where} states.{name} must be a unit, or a table with {', '.join(sorted(known))}")
         for key in ("start", "min", "max"):
-            if key in entry and not _number(entry[key]):
+            if key in entry and not is_finite_number(entry[key]):
                 raise RecordingError(f"{where} states.{name} {key} must be a finite number, got {entry[key]!r}")
         low, high = float(entry.get("min", -np.inf)), float(entry.get("max", np.inf))
         start = float(entry.get("start", min(max(0.0, low), high)))
@@ -456,7 +457,3 @@ def _traced(
         return builder_of(names, head["operations"], arrays["registers"], head["results"])
     except (KeyError, ValueError, TypeError) as error:
         raise EquationError(f"function: {path} gave something that is no list of operations ({error})") from error
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))

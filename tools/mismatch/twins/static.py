@@ -14,6 +14,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
 from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
+from tools.numbers import is_finite_number
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,6 @@ def _one(recording: Recording, value: object, name: str, output: str, i: int) ->
         value = value[i]
     if value is None or value is np.nan:
         return float("nan")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if not is_finite_number(value):
         raise RecordingError(f"{recording.path}: [twin.parameters] {name} must be a finite number, got {value!r}")
     return float(value)
