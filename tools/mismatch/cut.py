@@ -14,7 +14,7 @@ from hal.trust import allow_name, path_inside
 from tools.errors import InputError
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_clock import LONGEST_GAP, in_seconds, on_grid
-from tools.mismatch.recording_columns import column_units, read_columns
+from tools.mismatch.recording_columns import MAX_SAMPLES, column_units, read_columns
 from tools.mismatch.recording_load import MIN_SAMPLES, descriptor
 from tools.mismatch.recording_ranges import MIN_SPAN
 from tools.toml_text import toml_text
@@ -126,6 +126,11 @@ def cut_columns(
         raise InputError(f"{data}: the longest stretch has {kept.size} samples; at least {MIN_SAMPLES} are needed")
     close = steps[inside & (steps <= 1.5 * usual)]
     dt = 1.0 / rate_hz if rate_hz is not None else float(np.mean(close)) if close.size else usual
+    made = float(np.sum(long_s[chosen])) / dt
+    if made > MAX_SAMPLES:
+        raise InputError(
+            f"{data}: {made:.3g} samples at {1 / dt:g} Hz; at most {MAX_SAMPLES} are made: lower --resample"
+        )
     parts: list[dict[str, Array]] = []
     filled, sizes = 0, []
     for k in chosen:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tools.errors import InputError, RecordingError
-from tools.mismatch.cut import cut
+from tools.mismatch.cut import cut, cut_columns
 from tools.mismatch.recording_load import load
 
 TEXT = """format = 1
@@ -110,3 +110,9 @@ def test_a_cut_does_not_replace_its_recording(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="name another folder"):
         cut(folder, folder / ".." / folder.name)
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_a_rate_that_makes_more_samples_than_a_recording_may_have_is_refused(tmp_path: Path):
+    t = np.arange(300) / 100.0
+    with pytest.raises(InputError, match=r"2\.69e\+09 samples at 9e\+08 Hz; at most 50000000 are made"):
+        cut_columns(tmp_path / "data.csv", t, {"x": np.sin(t)}, rate_hz=9e8)
