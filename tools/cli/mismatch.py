@@ -23,7 +23,7 @@ from tools.terminal import table_of, task_name
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
     from tools.mismatch.new import NewRecording
-    from tools.mismatch.recording import Recording
+    from tools.mismatch.recording import Array, Recording
 
 # each command imports its modules itself, so that `micron --help` does not wait for the engine
 
@@ -397,11 +397,16 @@ def simulate(
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import load
         from tools.mismatch.report.wording import percent
+        from tools.mismatch.simulate_bounds import run_bounded
 
         loaded = load(recording or twin)
         for line in as_read(loaded):
             console().print(line, highlight=False)
-        simulated = simulate_own(loaded) if recording is None else simulate_file(twin, recording)
+
+        def run() -> dict[str, Array]:
+            return simulate_own(loaded) if recording is None else simulate_file(twin, recording)
+
+        simulated = run_bounded(twin, loaded, run)
         rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
             write_text_atomic(out, columns(loaded, simulated))

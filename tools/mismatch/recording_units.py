@@ -57,6 +57,7 @@ def read_in(recording: Recording, to: dict[str, str]) -> Recording:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a twin that diverges
 def in_twin_units(recording: Recording) -> Recording:
     """Return the recording in the units of its twin of matrices or equations, with a note on the choice.
 
@@ -78,7 +79,7 @@ def in_twin_units(recording: Recording) -> Recording:
         try:
             moved = read_in(recording, to)
             ratio = _amplitude_ratios(moved)
-        except (RecordingError, NotTrusted):
+        except (RecordingError, NotTrusted, np.linalg.LinAlgError):
             return recording
         cost = 0.0 if all(si == in_si for si in way) else CLEAR
         for o, r in ratio.items():
