@@ -41,6 +41,8 @@ RecordingsArgument = Annotated[
 SeedOption = Annotated[
     int, typer.Option(min=0, help="Seed of the search; the same recording and seed give the same answer.")
 ]
+MOST_NAMED = 12
+"""Largest number of unused columns that are named."""
 MOST_SHARED = 1_000_000
 """Samples above which one process of this machine works alone: each further one would hold a gigabyte of columns."""
 
@@ -395,13 +397,19 @@ def simulate(
         decide_on([twin, recording or twin], trust, allow_outside)
         from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
         from tools.mismatch.export.write import columns
-        from tools.mismatch.recording_load import load
+        from tools.mismatch.recording_load import columns_left_out, load
         from tools.mismatch.report.wording import percent
         from tools.mismatch.simulate_bounds import run_bounded
 
         loaded = load(recording or twin)
         for line in as_read(loaded):
             console().print(line, highlight=False)
+        left_out = columns_left_out(recording or twin)
+        if left_out:
+            more = f" and {len(left_out) - MOST_NAMED} more" if len(left_out) > MOST_NAMED else ""
+            console().print(
+                f"columns not used: {', '.join(left_out[:MOST_NAMED])}{more}", highlight=False, markup=False
+            )
 
         def run() -> dict[str, Array]:
             return simulate_own(loaded) if recording is None else simulate_file(twin, recording)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,12 @@ from hal.trust import path_inside
 from tools.errors import RecordingError
 from tools.mismatch.input_noise import conditional_mean
 from tools.mismatch.recording import Array, Recording, TwinText
-from tools.mismatch.recording_channels import converted, finite_number, read_channels, refuse_equal_columns
+from tools.mismatch.recording_channels import Channel, converted, finite_number, read_channels, refuse_equal_columns
 from tools.mismatch.recording_clock import CUT, in_seconds, on_grid, time_step
-from tools.mismatch.recording_columns import SUFFIXES, column_units, read_columns
+from tools.mismatch.recording_columns import SUFFIXES, column_names, column_units, read_columns
 from tools.mismatch.recording_ranges import read_conditions, read_segments, read_split
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
+from tools.numbers import is_finite_number
 
 MIN_SAMPLES = 50
 TOP_KEYS = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions"}
@@ -60,6 +62,8 @@ def from_table(
     data_path = path if columns is not None else path_inside(path, str(data_name))
     in_file = column_units(data_path) if columns is None and data_path.is_file() else {}
     channels = read_channels(where, text["channels"], words, twin.kind, notes, in_file)
+    if twin.kind == "ode":
+        notes += _unused_names(twin.parameters, channels)
     rate, time_column = _clock(where, text)
     names = [c.column for c in channels]
     if time_column is not None and time_column not in names:
@@ -137,6 +141,34 @@ def _unread(twin: object, kind: str) -> list[str]:
         for k in twin
         if k not in known
     ]
+
+
+def _unused_names(table: Mapping[str, Any], channels: Sequence[Channel]) -> list[str]:
+    """Return a note on each name of an ode's outputs, units and parameters that belongs to nothing."""
+
+    def of(key: str) -> Mapping[str, Any]:
+        value = table.get(key)
+        return value if isinstance(value, Mapping) else {}
+
+    outputs = {c.signal for c in channels if c.role == "output"}
+    numbers = {k for k, v in table.items() if is_finite_number(v)}
+    known = {c.signal for c in channels} | {f"{o}_offset" for o in outputs} | numbers
+    notes = [f"[twin.outputs] {o}: no channel is this output; not used" for o in of("outputs") if o not in outputs]
+    notes += [
+        f"[twin.units] {n}: no signal or parameter has this name; not used" for n in of("units") if n not in known
+    ]
+    if "equations" in table:
+        read = set(re.findall(r"[^\W\d]\w*", " ".join(map(str, (*of("equations").values(), *of("outputs").values())))))
+        notes += [f"[twin.parameters] {n}: no equation has this name; not used" for n in table if n in numbers - read]
+    return notes
+
+
+def columns_left_out(path: Path) -> list[str]:
+    """Return the columns of numbers in the data file of a descriptor that it does not name. Raises RecordingError."""
+    path = path / "recording.toml" if path.is_dir() else path
+    text = _toml(path)
+    used = {text.get("time_column"), *(c["column"] for c in text["channels"])}
+    return [name for name in column_names(path_inside(path, str(text["data"]))) if name not in used]
 
 
 def _clock(where: str, text: Mapping[str, Any]) -> tuple[float | None, str | None]:
