@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +24,7 @@ from hal.errors import HalError
 from hal.trust import NotTrusted
 from tools.errors import InputError, OutputError
 from tools.interrupt import begin_command, is_stopped, note_stop
+from tools.output import check_writable
 from tools.terminal import plain_console
 
 JsonOption = Annotated[
@@ -30,6 +32,8 @@ JsonOption = Annotated[
 ]
 
 
+PICTURES = (".png", ".svg", ".pdf", ".jpg")
+"""Formats of a picture that is drawn with matplotlib, by the ending of its file."""
 DECIDING = (
     ("mismatch", "diagnose"),
     ("mismatch", "apply"),
@@ -76,6 +80,34 @@ def print_error(message: str) -> None:
 def print_note(message: str) -> None:
     """Print ``note: message`` on standard error."""
     console().print(Text.assemble(("note:", "yellow"), " ", message), soft_wrap=True)
+
+
+def check_picture(path: Path | None, formats: Sequence[str] = PICTURES) -> None:
+    """Refuse a picture whose ending is none of ``formats``: ``InputError``."""
+    if path is not None and path.suffix.lower() not in formats:
+        raise InputError(f"{path}: a picture ends in {' or '.join(formats)}; name such a file")
+
+
+def place_picture(
+    chosen: Path | None, default: Path, *, formats: Sequence[str] = PICTURES, reads: Sequence[str | Path | None] = ()
+) -> Path | None:
+    """Return the file for a picture, checked before the work: ``chosen``, else ``default``, whose folder will be made.
+
+    Raises InputError for a chosen one that cannot be written; for the default that is a note, and there is no picture.
+    """
+    if chosen is not None:
+        check_writable(chosen, reads=reads)
+        check_picture(chosen, formats)
+        return chosen
+    folder = default.parent
+    while not folder.exists():
+        folder = folder.parent
+    try:
+        check_writable(folder / default.name)
+    except InputError as error:
+        print_note(f"no picture will be written: {error}")
+        return None
+    return default
 
 
 @contextmanager

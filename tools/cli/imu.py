@@ -11,7 +11,7 @@ import typer
 from rich.progress import BarColumn, Progress, TimeRemainingColumn
 
 from tools.cli.bench_option import bench_path, pace_of
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.cli.common import Exit, JsonOption, check_picture, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
@@ -70,6 +70,7 @@ def imu(
 
     with clear_errors():
         check_writable(json_file, picture, reads=[*(recording or ()), *(fall or ()), turned, bench])
+        check_picture(picture)
         if (bench is None) == (not recording and not fall and turned is None):
             raise InputError("give recordings, or --bench FILE to measure: one of the two")
         if picture is not None and bench is None and not recording:

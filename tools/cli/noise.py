@@ -9,13 +9,16 @@ import typer
 from rich.table import Table
 
 from tools.cli.bench_option import bench_path
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, console, data_console, place_picture
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_names, check_writable, write_json
 
 if TYPE_CHECKING:
     from tools.calibrate.logs import SensorLog
+
+PICTURE = Path("out/noise.png")
+"""Default file of the picture."""
 
 
 def noise(
@@ -37,16 +40,17 @@ def noise(
             metavar="FILE|NAME", help="Bench of the instrument that made the log; its calibrated axes are used."
         ),
     ] = None,
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the deviation.")] = Path(
-        "out/noise.png"
-    ),
+    image: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help=f"Picture (PNG) of the deviation; default {PICTURE}."),
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Compute the overlapping Allan deviation of a recording and fit white noise, flicker, random walk and ramp.
 
     The JSON is what a bench names as [firmware] noise = "FILE": the attitude filters then use these figures.
 
-    Example: micron noise rest.npz --rate-hz 100 --picture out/noise.png
+    Example: micron noise rest.npz --rate-hz 100 --picture noise.png
 
     For a bench: micron noise out/rest --bench micron --shortest-s 0.1 --json out/noise.json
     """
@@ -59,7 +63,8 @@ def noise(
 
     with clear_errors():
         check_names(image)
-        check_writable(json_file, reads=[recording, bench])
+        check_writable(json_file, image, reads=[recording, bench])
+        image = place_picture(image, PICTURE, reads=[recording, bench])
         log = load_log(recording, rate_hz)
         if bench is not None:
             log = calibrated_log(log, bench_path(bench))
@@ -90,8 +95,9 @@ def noise(
             missed = f", off by {100.0 * model.excess:.0f} %" if model.excess > 0.0 else ""
             table.add_row(name, *cells, f"{model.shortest_s:g}{missed}")
         data_console().print(table)
-        save_allan_picture(models, image)
-        console().print(f"picture: {image}")
+        if image is not None:
+            save_allan_picture(models, image)
+            console().print(f"picture: {image}")
         write_json(
             {
                 "format": 1,

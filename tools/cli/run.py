@@ -31,7 +31,7 @@ from firmware_py.tremor.config import Method, all_methods, why_unknown
 from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, ScaleOption, SeedOption, bench_path
-from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture
 from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from tools.mismatch.watch.live import Settings
     from tools.reports.run_live import TipWatch
 
+PICTURE = Path("out/run.png")
+"""Default file of the picture."""
 FULL_EFFECT = 4
 """Effect (scale of ``--max-effect``) of what moves the outputs."""
 SETTLE_S = 2.0
@@ -100,8 +102,13 @@ def run(
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a self-contained HTML report.")] = None,
     image: Annotated[
-        Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the tip without and with compensation.")
-    ] = Path("out/run.png"),
+        Path | None,
+        typer.Option(
+            "--picture",
+            metavar="FILE",
+            help=f"Picture (PNG) of the tip without and with compensation; default {PICTURE}.",
+        ),
+    ] = None,
 ) -> None:
     """Run the instrument in closed loop and report what was left of the tremor.
 
@@ -112,7 +119,9 @@ def run(
     """
     with clear_errors():
         check_names(image)
-        check_writable(json_file, html, record, reads=[bench, hand, manual, watch])
+        reads = [bench, hand, manual, watch]
+        check_writable(json_file, html, record, image, reads=reads)
+        image = place_picture(image, PICTURE, formats=(".png",), reads=reads)
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
         if max_effect is not None and not inject and manual is None:

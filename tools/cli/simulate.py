@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, HandOption, ScaleOption, SeedOption, bench_path
-from tools.cli.common import JsonOption, clear_errors, console
+from tools.cli.common import JsonOption, check_picture, clear_errors, console
 from tools.cli.run import complete_result
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_json
@@ -47,6 +47,7 @@ def simulate_command(
     delay_s = COMMAND_DELAY_S if delay_us is None else 1e-6 * delay_us
     with clear_errors():
         check_writable(json_file, image, reads=[bench, hand])
+        check_picture(image, (".png",))
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
         file = bench_path(bench)

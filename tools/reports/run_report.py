@@ -287,7 +287,7 @@ def write_report(
     *,
     json_file: str | None,
     html: Path | None,
-    image: Path,
+    image: Path | None,
     more: Sequence[str] = (),
 ) -> None:
     """Write table, JSON, picture and page of a run, none of which depends on another one, then the lines ``more``.
@@ -303,8 +303,9 @@ def write_report(
     if truth is not None and result["tremor"]["reduction_percent"] is not None:
         with outputs.part("picture"):
             png = picture(truth, result)
-            save_picture(png, image)
-            console.print(f"picture: {image}")
+            if image is not None:
+                save_picture(png, image)
+                console.print(f"picture: {image}")
     if html is not None:
         with outputs.part("page"):
             write_text_atomic(html, html_page(result, png))
