@@ -52,6 +52,7 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
     before = list(base.pop("effects", []))
     kept = [p for p in found if p["name"] not in EVENTS]
     notes = [f"{p['name']} is an event of that recording and no part of the twin" for p in found if p["name"] in EVENTS]
+    notes += _other_recording(recording.path, report.get("recording"))
     effects = [*before, *report_effects(kept)]
     with_effects = replace(recording, twin=TwinText(recording.twin.kind, base, tuple(effects)))
     try:
@@ -121,6 +122,15 @@ def check_outputs(recording: Recording, report: Mapping[str, Any]) -> None:
             f"the report's outputs ({reported}) are not those of {recording.path} ({have});"
             " give the report of this recording"
         )
+
+
+def _other_recording(path: Path, named: object) -> list[str]:
+    """Return a note if a report names another recording than ``path``; a folder that was moved is the same one."""
+    parts = [part for part in Path(named).parts if part not in (".", "..")] if isinstance(named, str) else []
+    same = min(len(parts), 2)  # the file, and its folder if the report names it
+    if not parts or list(path.resolve().parts[-same:]) == parts[-same:]:
+        return []
+    return [f"the report names the recording {named}, and this is {path}; its figures are taken as they are"]
 
 
 def report_effects(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

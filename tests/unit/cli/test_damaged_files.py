@@ -120,3 +120,14 @@ def test_an_unreadable_recording_of_a_folder_is_a_row_of_the_table(
     done = CliRunner().invoke(app, ["mismatch", "diagnose", "all", "--jobs", "1"])
     assert done.exit_code == Exit.BAD_INPUT
     assert "Permission denied" in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("named", "is_noted"),
+    [("elsewhere/recording.toml", True), ("rec/recording.toml", False), ("recording.toml", False), (None, False)],
+)
+def test_a_report_that_names_another_recording_is_noted(folder: Path, named: str | None, is_noted: bool) -> None:
+    (folder / "report.json").write_text(json.dumps({**missing_physics().to_json(), "recording": named}))
+    done = CliRunner().invoke(app, ["mismatch", "apply", "rec", "report.json", "--out", "twin.toml"])
+    assert done.exit_code == 0, done.output
+    assert ("note: the report names the recording elsewhere" in done.stderr) is is_noted
