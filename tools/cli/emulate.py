@@ -64,6 +64,11 @@ def emulate(
         if command and program is None:
             raise InputError(f"{command[0]}: no such program; name one that is on the PATH, or its path")
         file = load_bench(bench_path(bench))
+        buses = [bus.kind for bus in file.description.bus.values()]
+        if len(can or ()) > buses.count("can"):
+            raise InputError(f"--can: {file.path} has {buses.count('can')} CAN buses; name no more interfaces")
+        if tcp is not None and "serial" not in buses:
+            raise InputError(f"--tcp belongs to serial buses, and {file.path} has none; leave it out")
         columns = [read_stimulus(text) for text in stimulus or ()]
         with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
             write_json(served.as_dict(), json_file)

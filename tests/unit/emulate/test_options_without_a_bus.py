@@ -1,0 +1,17 @@
+"""Options of ``micron emulate`` for a bus that the bench does not have are refused."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from tools.cli.main import app
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [("--can vcan7", "has 0 CAN buses"), ("--tcp 0", "--tcp belongs to serial buses")]
+)
+def test_an_option_for_a_bus_that_is_not_there_is_refused(words: str, message: str) -> None:
+    done = CliRunner().invoke(app, ["emulate", "imus", *words.split(), "--", "true"])
+    assert done.exit_code == 2, done.output
+    assert message in done.stderr
