@@ -215,3 +215,11 @@ def test_a_regression_in_blocks_is_that_of_the_whole() -> None:
     found = Regression(blocks)
     assert found.less(y) == pytest.approx(true, abs=1e-12)
     assert found.less(y[:, 0]) == pytest.approx(true[:, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("diverged", [1e180, np.inf, np.nan])
+def test_a_derivative_that_diverged_is_left_out_of_a_regression(diverged: float) -> None:
+    rng = np.random.default_rng(2)
+    one, y = rng.standard_normal((50, 1)), rng.standard_normal(50)
+    wide = np.column_stack([one, np.full(50, diverged)])
+    assert Regression([wide]).less(y) == pytest.approx(Regression([one]).less(y))

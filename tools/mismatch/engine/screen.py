@@ -256,6 +256,9 @@ def _is_weight(model: Model, j: int) -> bool:
     return any(w.start <= j < w.stop for _, w in (model.slices(k) for k in range(len(model.placed))))
 
 
+DIVERGED = 1e100  # of a derivative in noise rms: its square must stay finite
+
+
 class Regression:
     """Solves least squares with columns of which each block of rows (an output) has few: zeros are not multiplied.
 
@@ -267,7 +270,9 @@ class Regression:
         k = blocks[0].shape[1]
         gram = np.zeros((k, k))
         for block in blocks:
-            seen = np.flatnonzero(np.any(block != 0.0, axis=0))
+            # a parameter whose small step makes the simulation diverge has no derivative
+            largest = np.max(np.abs(block), axis=0, initial=0.0)
+            seen = np.flatnonzero((largest > 0.0) & (largest < DIVERGED))
             x = block if seen.size == k else block[:, seen]
             self.blocks.append((seen, x))
             gram[np.ix_(seen, seen)] += x.T @ x
