@@ -10,7 +10,7 @@ from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter,
 from sim_devices.physics.statistics import best_starts, thin, value_range
 
 LEAST_BEYOND = 0.05
-"""Least share of the signal's range that lies beyond the zone: without it nothing says that the response comes back."""
+"""Least response beyond the near edge of a zone, in ranges of the signal: without it there is only a limit."""
 
 
 def _dead_parts(settings: Settings) -> Parts:
@@ -42,19 +42,22 @@ def _dead_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("half_width", float(p[0]), "{in}"),
         Human("centre", float(p[1]), "{in}"),
         Human("slope_lost_inside", float(share), "1"),
-        Human("range_beyond", _range_beyond(float(p[0]), float(p[1]), settings), "1"),
+        Human("response_beyond", _response_beyond(float(p[0]), float(p[1]), float(share), settings), "1"),
     )
 
 
-def _range_beyond(half_width: float, centre: float, settings: Settings) -> float:
-    """Return the share of the signal's range that lies beyond the zone, on the side away from zero.
+def _response_beyond(half_width: float, centre: float, lost: float, settings: Settings) -> float:
+    """Return the response beyond the near edge of the zone, on the side away from zero, in ranges of the signal.
 
-    A zone about zero is left on either side; of one that is beside zero the far edge must be passed, or it is a limit.
+    A zone about zero is left on either side. Of one beside zero the far edge must be passed, or some slope be left
+    inside: else the response never comes back, and the near edge is a limit.
     """
     lo, hi = settings.get("range", (-1.0, 1.0))
-    below, above = centre - half_width - lo, hi - centre - half_width
-    beyond = below if centre + half_width < 0.0 else above if centre - half_width > 0.0 else max(below, above)
-    return beyond / (hi - lo)
+    low, high = centre - half_width, centre + half_width
+    inside = (1.0 - lost) * (min(high, hi) - max(low, lo))
+    below, above = low - lo, hi - high
+    beyond = below if high < 0.0 else above if low > 0.0 else max(below, above)
+    return (max(beyond, 0.0) + inside) / (hi - lo)
 
 
 DEAD_ZONE = Effect(
@@ -72,7 +75,7 @@ DEAD_ZONE = Effect(
     basis=lambda x, ctx, q, settings: -np.clip(x - q[1], -q[0], q[0])[:, None],
     report=_dead_report,
     # a slope gained inside makes a limit of it; one that is lost whole scatters about 1
-    limits={"slope_lost_inside": (0.0, 1.1), "range_beyond": (LEAST_BEYOND, 1.0)},
+    limits={"slope_lost_inside": (0.0, 1.1), "response_beyond": (LEAST_BEYOND, 1.0)},
     vanishes_with=(("half_width",), ("slope_lost_inside",)),
     essential=("half_width",),
 )

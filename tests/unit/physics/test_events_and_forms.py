@@ -122,21 +122,22 @@ def test_memory_that_no_speed_changes_is_not_called_rate_dependent() -> None:
     assert low < {h.name: h.value for h in effect.report(p, settings, 1.0)}["change_with_speed"] < high
 
 
-def test_a_dead_zone_beside_zero_is_one_only_where_its_far_edge_is_passed() -> None:
+def test_a_dead_zone_beside_zero_is_one_only_where_the_response_comes_back() -> None:
     effect = EFFECTS["dead_zone"]
-    least, most = effect.limits["range_beyond"]
+    least, most = effect.limits["response_beyond"]
 
-    def beyond(half_width: float, centre: float, lo: float, hi: float) -> float:
+    def beyond(half_width: float, centre: float, lost: float, lo: float, hi: float) -> float:
         assert effect.report is not None
-        found = effect.report(np.array((half_width, centre, 1.0), np.float64), {"range": (lo, hi)}, 1.0)
-        return {h.name: h.value for h in found}["range_beyond"]
+        found = effect.report(np.array((half_width, centre, lost), np.float64), {"range": (lo, hi)}, 1.0)
+        return {h.name: h.value for h in found}["response_beyond"]
 
-    assert beyond(0.2, 0.0, -1.0, 1.0) == pytest.approx(0.4)
-    assert beyond(0.2, 0.0, 0.0, 1.0) == pytest.approx(0.8)  # a valve that opens one way
-    assert beyond(0.1, 0.5, -1.0, 1.0) == pytest.approx(0.2)
+    assert beyond(0.2, 0.0, 1.0, -1.0, 1.0) == pytest.approx(0.4)
+    assert beyond(0.2, 0.0, 1.0, 0.0, 1.0) == pytest.approx(0.8)  # a valve that opens one way
+    assert beyond(0.1, 0.5, 1.0, -1.0, 1.0) == pytest.approx(0.2)
     assert least < 0.2 < most
-    assert beyond(0.3, 0.9, 0.0, 1.0) < least  # the response never comes back: a limit at 0.6
-    assert beyond(0.3, -0.9, -1.0, 0.0) < least
+    assert beyond(0.3, 0.9, 1.0, 0.0, 1.0) < least  # a limit at 0.6
+    assert beyond(0.3, -0.9, 1.0, -1.0, 0.0) < least
+    assert beyond(0.3, 0.9, 0.25, 0.0, 1.0) == pytest.approx(0.3)  # it goes on with three quarters of its slope
 
 
 def test_a_smooth_drift_is_no_random_walk_and_a_walk_is_one() -> None:
