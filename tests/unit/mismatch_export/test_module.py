@@ -123,7 +123,7 @@ def tanks() -> Recording:
         "upper": "inflow*(pump + 2) - drain*upper",
         "lower": "drain*upper - (drain if lower > 0.5 else 0.5*drain)*lower + 0.01*temperature - max(lower, -1)**2",
     }
-    table["outputs"] = {"level": "lower", "both": "upper + 0.1*pump*lower - (lower - 1)"}
+    table["outputs"] = {"level": "lower", "both": "upper + 0.1*pump*lower - drain*(lower - 1)"}
     return equations({**table, "inflow": 1.5, "drain": 0.8, "hold": "zero"}, ("pump",), ("level", "both"), "V")
 
 

@@ -156,7 +156,9 @@ def test_a_parameter_may_follow_a_recorded_signal(tmp_path: Path) -> None:
     head = f'format = 1\ndata = "data.npz"\nrate_hz = {RATE_HZ}\n'
     found: list[np.ndarray] = []
     for law in ("tau", "(tau * (1 + 0.05 * (temperature - 25)))"):
-        (tmp_path / "recording.toml").write_text(head + MOTOR.replace("/ tau", f"/ {law}") + channels)
+        # outputs that have the parameter follow as well
+        read = f'[twin.outputs]\nangle = "angle + 0.1 * {law} * speed"\n'
+        (tmp_path / "recording.toml").write_text(head + MOTOR.replace("/ tau", f"/ {law}") + read + channels)
         recording = load(tmp_path)
         twin = make(recording)
         places = [p.target for p in sites(twin, recording, EFFECTS["parameter_variation"])]

@@ -1,9 +1,13 @@
-"""Varies a fitted set of effects: one left out, one more, or one replaced; counts an effect's parameters."""
+"""Varies a fitted set of effects: one left out or one more; counts an effect's parameters."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_start import prepare, starts
@@ -20,10 +24,11 @@ def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
     )  # fmt: skip
 
 
-def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
-    """Return the fit with one effect replaced by a rival, prepared and started from the residual of the others."""
-    rest = reduced(problem, fitted, drop)
-    return added(problem, rest, rival)
+def stripped(problem: Problem, fitted: Fit, drop: Callable[[Placed], bool]) -> Fit:
+    """Return the fit without the effects that ``drop`` selects, everything else as it is."""
+    model = Model(problem.twin, [p for p in fitted.model.placed if not drop(p)])
+    theta = model.carry(fitted.model, fitted.theta, problem.recording)
+    return replace(fitted, model=model, theta=theta, residual=residuals(problem, model, theta))
 
 
 def added(problem: Problem, current: Fit, place: Placed) -> Fit:

@@ -126,6 +126,10 @@ class Inner:
     slot: Slot
 
 
+def _products(factors: Mapping[int, Sequence[str]]) -> dict[int, str]:
+    return {r: ") * (".join(parts) for r, parts in factors.items()}
+
+
 @dataclass
 class EquationLines:
     """Writes the lines of an ode twin: ``setup`` defines ``moving(t, drive)``, ``run`` calls it and reads outputs."""
@@ -145,11 +149,13 @@ class EquationLines:
             raise InputError(f"a twin of {self.twin.kind} has no numpy form to write; use --out FILE.toml or FILE.csv")
         self.programs = self.twin.equations
         self.signals = tuple(self.twin.inputs)
+        self.following: list[Inner] = []
 
     def see(self, inner: Sequence[Inner]) -> list[str]:
         """Return the context signals that equations or parameters follow; the lines take these and the inputs."""
         first = 1 + len(self.twin.state_list)
-        seen = {int(one.slot.placed.settings[PAIRS][1]) for one in inner if one.place.kind == "parameter"}
+        self.following = [one for one in inner if one.place.kind == "parameter"]
+        seen = {int(one.slot.placed.settings[PAIRS][1]) for one in self.following}
         for program in (self.programs.rates_program, self.programs.outputs):
             seen |= {int(r) for r in (*program.operations[:, 2:].flat, *program.results)}
         contexts = [s for i, s in enumerate(self.twin.signals, first) if s not in self.twin.inputs and i in seen]
@@ -160,13 +166,23 @@ class EquationLines:
         every = ["t", *states, *signals, *(f'p["{n}"]' for n in self.twin.names)]
         return {i: f"({n} * ({swayed[i]}))" if i in swayed else n for i, n in enumerate(every)}
 
+    def _followed(self, names: Sequence[str]) -> dict[int, list[str]]:
+        """Return the factors of the parameters that follow a signal, by register; ``names`` of states and signals."""
+        out: dict[int, list[str]] = {}
+        for one in self.following:
+            parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])
+            centre = numbers(one.slot.setting("centre"))
+            out.setdefault(parameter, []).append(f"1 + {one.slot.at('per_unit')} * ({names[signal - 1]} - {centre})")
+        return out
+
     def run(self) -> list[str]:
         """Return the lines that turn inputs into outputs."""
         signals = [self.name(s) for s in self.twin.signals]
         drive = ", ".join(self.name(s) for s in self.signals)
         lines = [f"x = moving(t, np.stack([{drive}], axis=1))"]
         columns = [f"x[:, {i}]" for i in range(len(self.twin.state_list))]
-        shared, read = program_code(self.programs.outputs, self._variables(columns, signals, {}))
+        changed = _products(self._followed([*columns, *signals]))
+        shared, read = program_code(self.programs.outputs, self._variables(columns, signals, changed))
         lines += shared
         # all inputs are read before an output of the same name may hide them
         # outputs that depend on parameters alone need a value at every instant, too
@@ -179,19 +195,14 @@ class EquationLines:
         states = [f"{s.name}_" if s.name in TAKEN else s.name for s in twin.state_list]
         signals = [f"{s}_" if s in TAKEN else s for s in twin.signals]
         given = [n for n, s in zip(signals, twin.signals, strict=True) if s in self.signals]
-        swayed: dict[int, list[str]] = {}
+        swayed = self._followed([*states, *signals])
         turned: set[int] = set()
         for one in inner:
-            if one.place.kind == "parameter":
-                parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])
-                follows = [*states, *signals][signal - 1]
-                centre = numbers(one.slot.setting("centre"))
-                swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('per_unit')} * ({follows} - {centre})")
             if one.place.kind == "direction":
                 parameter, state = (int(v) for v in one.slot.placed.settings[PAIRS])
                 turned.add(state)
                 swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('relative_change')} * way_{state}")
-        changed = {r: ") * (".join(parts) for r, parts in swayed.items()}
+        changed = _products(swayed)
         shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
         sub, _ = self.substeps
         h = "dt" if sub == 1 else f"dt / {sub}"

@@ -92,11 +92,28 @@ class Search:
             if self.store.ranked()[0].key == best.key:
                 break
             self.grow()
-        if len(self.store.ranked()[0].names) > 1:
-            self.swap(self.store.ranked()[0])
+        for _ in range(SWAPS):
+            best = self.pruned()
+            if len(best.names) < 2:
+                break
+            self.swap(best)
+            if self.store.ranked()[0].key == best.key:
+                break
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
+
+    def pruned(self) -> Scored:
+        """Drop names of the best set while the score grows, and return the best one.
+
+        A larger set may lead a fit past an optimum at which the smaller one has ended.
+        """
+        while True:
+            best = self.store.ranked()[0]
+            for name in sorted(best.names):
+                self.store.without(best, lambda p, n=name: p.effect.name == n)
+            if self.store.ranked()[0].key == best.key:
+                return best
 
     def best_without(self, best: Scored, name: str) -> Scored:
         """Return the best set without ``name``: a beam of sets that share their first name grows no other account."""
@@ -176,6 +193,8 @@ class Search:
                 for s in (s for s in here if rival in s.names):
                     if left & set(s.placed[0].outputs):
                         left -= set(s.placed[0].outputs)
+                        if grown is rest:
+                            self.store.instead(best, name, s.placed[0])
                         grown = self.store.with_one(grown, s.placed[0])
 
     def grow(self) -> None:

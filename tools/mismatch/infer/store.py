@@ -15,7 +15,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
-from tools.mismatch.engine.vary import added, beyond_limits, size
+from tools.mismatch.engine.vary import added, beyond_limits, size, stripped
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.density import (
@@ -224,6 +224,15 @@ class Store:
             return known
         with np.errstate(all="ignore"):
             return self.put(added(self.problem, s.fitted, place))
+
+    def instead(self, s: Scored, name: str, place: Placed) -> Scored:
+        """Return the set with another effect in place of ``name``.
+
+        The others start as they are beside ``name``; fitted without it, they have bent.
+        """
+        with np.errstate(all="ignore"):
+            rest = stripped(self.problem, s.fitted, lambda p: p.effect.name == name)
+            return self.put(added(self.problem, rest, place))
 
     def joined(self, s: Scored, one: Scored) -> Scored:
         """Return the set joined with the single effect of another set, started from that fit."""

@@ -79,7 +79,8 @@ class Inside:
         )
 
 
-NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)), np.zeros((0, JOINT)))
+NO_SWAY = np.zeros((0, SWAY))
+NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), NO_SWAY, np.zeros((0, JOINT)))
 
 
 class Equations(Protocol):
@@ -99,8 +100,8 @@ class Equations(Protocol):
         """Return the states (n, s) of a free run; ``values`` are the parameters, ``limits`` those of each state."""
         ...
 
-    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
-        """Return the outputs (n, q)."""
+    def readings(self, x: Array, u: Array, t: Array, values: Array, sway: Array = NO_SWAY) -> Array:
+        """Return the outputs (n, q); ``sway``: rows of the parameters that follow a signal (``Inside``)."""
         ...
 
     def rates(self, x: Array, u: Array, values: Array) -> Array:
@@ -135,9 +136,9 @@ class Programs:
         """See Equations."""
         return run_equations(self._set(self.rates_program, values), drive, inside.packed, x0, limits)
 
-    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+    def readings(self, x: Array, u: Array, t: Array, values: Array, sway: Array = NO_SWAY) -> Array:
         """See Equations."""
-        return run_readings(self._set(self.outputs, values), x, u, t)
+        return run_readings(self._set(self.outputs, values), x, u, t, sway)
 
     def rates(self, x: Array, u: Array, values: Array) -> Array:
         """See Equations."""
@@ -145,7 +146,7 @@ class Programs:
 
     def rates_along(self, x: Array, u: Array, t: Array, values: Array) -> Array:
         """See Equations."""
-        return run_readings(self._set(self.rates_program, values), x, u, t)
+        return run_readings(self._set(self.rates_program, values), x, u, t, NO_SWAY)
 
     def _set(self, program: Program, values: Array) -> Program:
         registers = program.registers.copy()

@@ -254,7 +254,10 @@ class OdeTwin(Head):
 
         def make() -> Array:
             x, u = self.states(run, used, theta, forces)
-            return np.ascontiguousarray(self.equations.readings(x, u, run.t, self.values(theta)).T)
+            values = self.values(theta)
+            return np.ascontiguousarray(
+                self.equations.readings(x, u, run.t, values, self.packed(forces, values).sway).T
+            )
 
         with np.errstate(all="ignore"):
             stacked = remember(run.memo, key, make)
@@ -283,20 +286,26 @@ class OdeTwin(Head):
         other, _, target, ratio = place.pairs[:4]
         return -ratio * float(a[int(target), place.position] / a[place.target, int(other)])
 
+    def swaying(self, forces: Sequence[Force]) -> Array:
+        """Return the rows (k, SWAY) of the parameters that vary, in the order of their places."""
+        by: dict[str, list[Array]] = {}
+        for f in forces:
+            if f.effect.fill is not None and self.place(f.target).kind in ("parameter", "direction"):
+                by.setdefault(f.target, []).append(f.effect.fill(f.q, f.weights, f.settings)["sway"])
+        return np.array([row for rows in by.values() for row in rows], np.float64).reshape(-1, SWAY)
+
     def packed(self, forces: Sequence[Force], values: Array) -> Inside:
         """Return forces and flows, packed for the compiled loop; ``values``: the parameters of the equations."""
         by: dict[str, list[Force]] = {}
         for f in forces:
             by.setdefault(f.target, []).append(f)
         place: list[tuple[int, int, int, int]] = []
-        sway: list[Array] = []
         rows: list[Rows] = []
         flows: list[Array] = []
         joints: list[Array] = []
         for name, here in by.items():
             filled = [f.effect.fill(f.q, f.weights, f.settings) for f in here if f.effect.fill is not None]
             flows += [r["flows"].reshape(-1, FLOW) for r in filled if "flows" in r]
-            sway += [r["sway"] for r in filled if "sway" in r]
             solid = [f for f, r in zip(here, filled, strict=True) if not {"flows", "sway"} & set(r)]
             if solid and self.place(name).kind == "joint":
                 p = self.place(name)
@@ -312,7 +321,7 @@ class OdeTwin(Head):
             np.array(place, np.int64).reshape(-1, 4),
             tuple(rows),
             np.concatenate(flows) if flows else np.zeros((0, FLOW)),
-            np.array(sway, np.float64).reshape(-1, SWAY),
+            self.swaying(forces),
             np.array(joints, np.float64).reshape(-1, JOINT),
             fastest_of(forces),
         )
@@ -414,7 +423,7 @@ class OdeTwin(Head):
         tried: list[tuple[Array, Array]] = []
 
         def missed_of(x: Array) -> Array:
-            readings = self.equations.readings(x[at], part, t, values)
+            readings = self.equations.readings(x[at], part, t, values, inside.sway)
             behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
             return (measured[seen] - behind) * weight
 
@@ -442,7 +451,7 @@ class OdeTwin(Head):
 
         def misses_alone(x0: Array) -> Array:
             x = go(x0, before, after, alone, when)
-            readings = self.equations.readings(x, alone, when, values)
+            readings = self.equations.readings(x, alone, when, values, inside.sway)
             return (measured[first] - self._behind_paths(run, readings, first)) * weight
 
         x0 = self.as_read(x0, measured[starts], u[starts], run.t[starts], values, reading)

@@ -298,8 +298,11 @@ def run_equations(program, drive, packed, x0, limits):
 
 
 @kernel
-def run_readings(program, x, u, t):
-    """Return outputs (n, q) for states (n, s), inputs (n, m) and times (n,)."""
+def run_readings(program, x, u, t, sway):
+    """Return outputs (n, q) for states (n, s), inputs (n, m) and times (n,).
+
+    ``sway`` (k, SWAY) are varying parameters; one that follows a direction is constant here.
+    """
     operations, registers0, results = program
     n = u.shape[0]
     out = np.empty((n, results.size))
@@ -311,6 +314,11 @@ def run_readings(program, x, u, t):
             registers[1 + i] = x[k, i]
         for i in range(m):
             registers[1 + s + i] = u[k, i]
+        for c in range(sway.shape[0]):
+            registers[int(sway[c, 0])] = registers0[int(sway[c, 0])]
+        for c in range(sway.shape[0]):
+            if sway[c, 4] == 0.0:
+                registers[int(sway[c, 0])] *= 1.0 + sway[c, 2] * (registers[int(sway[c, 1])] - sway[c, 3])
         run_program(operations, registers)
         for j in range(results.size):
             out[k, j] = registers[results[j]]
