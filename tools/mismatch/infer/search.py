@@ -188,7 +188,7 @@ class Search:
             # alone the general effect may stand for what another name explains beside its plain case
             plain = [p.effect.plain for p in best.placed if p.effect.name == name]
             rivals = dict.fromkeys([*plain, *(n for s in near for n in s.names)])
-            for rival in [n for n in rivals if n not in best.names][:RIVALS]:
+            for rival in [n for n in rivals if n and n not in best.names][:RIVALS]:
                 grown, left = rest, set(outputs)
                 for s in (s for s in here if rival in s.names):
                     if left & set(s.placed[0].outputs):
