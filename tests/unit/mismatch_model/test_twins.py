@@ -337,3 +337,4 @@ def test_a_free_response_is_computed_no_further_than_it_can_be_felt() -> None:
         assert free[n:].max(initial=0.0) < 1e-12 * free.max()
         assert n < 100_000
     assert felt_at_most(np.array([[1.0]]), 777) == 777
+    assert felt_at_most(np.array([[np.inf, 0.0], [0.0, np.nan]]), 777) == 777  # a trial beyond all numbers

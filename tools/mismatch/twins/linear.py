@@ -242,6 +242,8 @@ def poles_of(ad: Array, blocks: Blocks) -> NDArray[np.complex128]:
 
 def felt_at_most(ad: Array, longest: int, blocks: Blocks = ()) -> int:
     """Return a bound on the samples after which a free response is below 1e-12 of its largest, at most ``longest``."""
+    if not np.all(np.isfinite(ad)):
+        return longest  # a trial of the search that grows beyond all numbers within a step
     slowest = float(np.max(np.abs(poles_of(ad, blocks)), initial=0.0))
     if slowest >= 1.0:
         return longest
