@@ -236,14 +236,14 @@ def blocks_of(ad: Array, blocks: Blocks) -> Blocks:
 
 
 def poles_of(ad: Array, blocks: Blocks) -> NDArray[np.complex128]:
-    """Return the eigenvalues of a block-diagonal ``ad``."""
+    """Return the eigenvalues of a block-diagonal ``ad``; infinite for one beyond all numbers, a trial of the search."""
+    if not np.all(np.isfinite(ad)):
+        return np.full(ad.shape[0], np.inf, np.complex128)
     return np.concatenate([np.linalg.eigvals(ad[a:b, a:b]) for a, b in blocks_of(ad, blocks)]).astype(np.complex128)
 
 
 def felt_at_most(ad: Array, longest: int, blocks: Blocks = ()) -> int:
     """Return a bound on the samples after which a free response is below 1e-12 of its largest, at most ``longest``."""
-    if not np.all(np.isfinite(ad)):
-        return longest  # a trial of the search that grows beyond all numbers within a step
     slowest = float(np.max(np.abs(poles_of(ad, blocks)), initial=0.0))
     if slowest >= 1.0:
         return longest

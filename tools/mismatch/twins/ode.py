@@ -254,10 +254,8 @@ class OdeTwin(Head):
 
         def make() -> Array:
             x, u = self.states(run, used, theta, forces)
-            values = self.values(theta)
-            return np.ascontiguousarray(
-                self.equations.readings(x, u, run.t, values, self.packed(forces, values).sway).T
-            )
+            readings = self.equations.readings(x, u, run.t, self.values(theta), self.swaying(forces))
+            return np.ascontiguousarray(readings.T)
 
         with np.errstate(all="ignore"):
             stacked = remember(run.memo, key, make)
