@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
 from tools.mismatch.engine.dependence import Dependence
-from tools.mismatch.engine.noise import NoiseFloor, floor_interval, noise_floor, repeat_floor, rest_floor
+from tools.mismatch.engine.noise import NoiseFloor, floor_interval, noise_floor, repeat_floor, rest_floor, without_lines
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.unexplained import Leftover
 from tools.mismatch.engine.verdict import fit_trouble, meaning_of
@@ -90,6 +90,23 @@ def test_stretches_at_rest_see_it_too(seed: int) -> None:
     assert found is not None
     assert found[0] == pytest.approx(NOISE_UM, rel=0.25)
     assert rest_floor(y, 50 + 40 * wave(rng, u.size)[:, None]) is None
+
+
+def test_mains_at_rest_is_a_line_and_no_noise() -> None:
+    """Hum of ten times the noise, in three short stretches at rest; slow coloured noise has no line."""
+    rng = np.random.default_rng(5)
+    u = 50.0 + 40.0 * wave(rng, 3000)
+    rest = np.zeros(u.size, np.bool_)
+    for a in (300, 1200, 2300):
+        rest[a : a + 130] = True
+        u[a : a + 130] = u[a]
+    quiet = 0.01 * rng.standard_normal(u.size)
+    hum = 0.14 * np.sin(2 * np.pi * 0.2503 * np.arange(u.size) + 0.4)
+    found = rest_floor(quiet + hum, u[:, None])
+    assert found is not None
+    assert found[0] == pytest.approx(0.01, rel=0.3)
+    slow = np.asarray(lfilter([1.0], [1.0, -0.95], quiet))
+    assert without_lines(np.where(rest, slow, 0.0), rest) == pytest.approx(np.where(rest, slow, 0.0))
 
 
 def test_an_output_that_still_rings_at_rest_is_no_noise() -> None:

@@ -11,6 +11,7 @@ upper bound then follows from the part of the residual that follows signals (``f
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -193,12 +194,58 @@ def _variance_without_lines(d: Array, window: int) -> float:
     return float(np.sum(np.where(density > 6.0 * usual, usual, density)[1:])) * float(frequency[1])
 
 
+MOST_LINES = 8
+"""Largest number of lines that are removed from stretches at rest."""
+LINE = 1e-6
+"""Largest probability, over all frequencies, that noise alone makes a line as high above its neighbours."""
+
+
+def without_lines(e: Array, at: NDArray[np.bool_]) -> Array:
+    """Return ``e`` (n,), which is zero but at the samples ``at`` (n,), without its lines.
+
+    A line is a peak of the periodogram that stands above its neighbours as no peak of noise does, whose ordinates are
+    exponential (Fisher 1929), and that a single sine of steady phase explains.
+    """
+    k = np.flatnonzero(at)
+    if k.size < LEAST_REST:
+        return e
+    width = round(2 * e.size / max(stop - start for start, stop in runs(at)))
+    step = max(1, width // 4)
+    near = NEIGHBOURS * width // step
+    for _ in range(MOST_LINES):
+        every = np.abs(np.fft.rfft(e, 2 * e.size)) ** 2
+        power = every[::step]
+        usual = median_filter(power, 2 * near + 1, mode="reflect") / math.log(2.0)
+        inner = slice(near, -near)
+        above = power[inner] / np.maximum(usual[inner], 1e-300)
+        if above.size == 0 or above.max() < math.log(k.size / LINE):
+            return e
+        peak = step * (near + int(np.argmax(above)))
+        # several stretches together show the frequency more finely than each does
+        peak = peak - width + int(np.argmax(every[peak - width : peak + width + 1]))
+        steps = np.linspace(peak - 1.0, peak + 1.0, 21) * np.pi / e.size
+        best = min((_sine(e[k], k, w) for w in steps), key=lambda f: float(np.sum((e[k] - f) ** 2)))
+        e = e.copy()
+        e[k] -= best
+    return e
+
+
+NEIGHBOURS = 8
+"""Number of ordinates of the longest stretch on either side of a peak whose median is the usual one."""
+
+
+def _sine(e: Array, k: NDArray[np.int64], w: float) -> Array:
+    """Return the sine of ``w`` radians a sample that fits ``e`` (m,) at the samples ``k`` (m,) best."""
+    design = np.column_stack([np.cos(w * k), np.sin(w * k)])
+    return np.asarray(design @ np.linalg.lstsq(design, e, rcond=None)[0], np.float64)
+
+
 REST = 1e-3  # largest movement, relative to an input's range, of an input at rest
 LEAST_REST = 64  # least samples of a stretch at rest, whose first half is left for settling
 
 
 def rest_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
-    """Estimate the noise of ``y`` (n,) where every input (n, k) rests and the output has settled.
+    """Estimate the noise of ``y`` (n,) where every input (n, k) rests and the output has settled, without lines.
 
     Returns (rms, standard error), or None if no stretch is long enough and settled.
     """
@@ -210,7 +257,8 @@ def rest_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
         return None
     level = np.round(inputs / (REST * size))
     still = np.concatenate([[False], np.all(np.abs(np.diff(level, axis=0)) <= 1, axis=1)])
-    power = count = 0.0
+    count = 0.0
+    calm = np.zeros(n)
     for a, b in runs(still):
         if b - a < LEAST_REST or np.any(np.ptp(inputs[a:b], axis=0) > 2 * REST * size):
             continue
@@ -219,8 +267,10 @@ def rest_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
         e = half - np.polynomial.Polynomial.fit(t, half, 2)(t)
         early, late = float(np.std(e[: e.size // 2])), float(np.std(e[e.size // 2 :]))
         if early <= 2.0 * late:
-            power += float(e @ e)
+            calm[(a + b) // 2 : b] = e
             count += e.size - 3
+    calm = without_lines(calm, calm != 0.0)
+    power = float(calm @ calm)
     if count < LEAST_REST / 2 or power <= 0.0:
         return None
     rms = float(np.sqrt(power / count))
