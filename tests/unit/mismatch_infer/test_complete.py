@@ -120,6 +120,9 @@ def test_events_within_their_own_size_are_told_from_heavy_tails() -> None:
     burst = np.where(at, rng.choice([-1.0, 1.0], 2700) * rng.uniform(10.0, 30.0, 2700), quiet)
     assert gain_of_events(burst, at, 2000.0, 0.05) > START.per_name
     assert gain_of_events(heavy, np.abs(heavy) > 6.0, 2000.0, 0.05) < 0.0
+    # a burst is marked with the samples beside its peak, which may be noise
+    wide = np.convolve(at, np.ones(3), "same") > 0
+    assert gain_of_events(burst, wide, 2000.0, 0.05) > START.per_name
 
 
 def test_the_chance_of_a_name_counts_every_candidate() -> None:

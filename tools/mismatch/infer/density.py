@@ -232,18 +232,21 @@ def gain_of_events(r: Array, events: NDArray[np.bool_], span: float, least: floa
         return 0.0
     span = min(span, 2.0 * float(np.max(np.abs(r[events]))))
 
-    def tails(x: Array) -> float:
-        def total(nu: float) -> float:
+    def tails(x: Array) -> tuple[float, float, float]:
+        def total(nu: float) -> tuple[float, float, float]:
             s = max(1.4826 * float(np.median(np.abs(x))), least)
             for _ in range(20):
                 s = max(float(np.sqrt(np.mean((nu + 1) / (nu + (x / s) ** 2) * x * x))), least)
-            return float(np.sum(student.logpdf(x, nu, scale=s)))
+            return float(np.sum(student.logpdf(x, nu, scale=s))), nu, s
 
         return max(total(nu) for nu in TAILS)
 
     event = math.log(share) - math.log(max(span, 1e-300))
-    usual = tails(r[~events]) + float(np.sum(~events)) * math.log1p(-share)
-    return usual + float(np.sum(events)) * event - tails(r)
+    usual, nu, scale = tails(r[~events])
+    # of a burst the samples beside its peak may be noise
+    within = student.logpdf(r[events], nu, scale=scale) + math.log1p(-share)
+    usual += float(np.sum(~events)) * math.log1p(-share)
+    return usual + float(np.sum(np.maximum(within, event))) - tails(r)[0]
 
 
 @dataclass(frozen=True)
