@@ -97,8 +97,9 @@ ONE_SIDED_CONDUCTION = Effect(
     guess=_guess,
     apply=lambda x, ctx, q, settings: conducted(x, float(q[0]), float(q[1]), _side(settings)),
     report=_report,
-    # at either end it would stand in for saturation in anything that is no circuit, and neither would be named
-    sites=("between",),
+    sites=("input", "output", "between"),
+    # elsewhere it would stand in for saturation, and neither would be named
+    end_units=("V", "mV", "kV"),
     vanishes_with=(("exponential_width",),),
     essential=("knee",),
 )

@@ -41,7 +41,8 @@ Kind = Literal["add", "linear", "nonlinear", "feedback"]
 """The way in which an effect acts on its target signal.
 
 add        x + basis(x, ...) @ weights
-linear     a linear operator on x (filter, delay, resampling): applied to every column of a design
+linear     a linear operator on x (filter, delay, resampling): applied to every column of a design; with a basis
+           its columns are added behind it
 nonlinear  any other map of x
 feedback   a force phi(position, velocity) @ weights inside the equation of motion; ``x`` is position
 """
@@ -249,6 +250,8 @@ class Effect:
     """Where a feedback effect acts: at a velocity, between two of them (a joint), at any other state (a level, a
     current, a temperature), at all such states at once, on a parameter of differential equations, or on one and the
     direction of a state."""
+    end_units: tuple[str, ...] = ()
+    """Units that the signal at an input or output must have for the effect to sit there; empty: any."""
     position_unit: str = ""
     """Unit that the position must have for a feedback effect; empty: any."""
     twins: tuple[str, ...] = ()
@@ -289,6 +292,9 @@ class Effect:
     proportional: bool = False
     """True if an effect of kind add is proportional to the signal. Behind columns of simulated output it cannot be
     distinguished from wrong parameters of the simulation."""
+
+    loses_mean: bool = False
+    """True if a constant signal does not pass the effect."""
 
     shifts_line: bool = False
     """True if it changes a gain or a zero alone: it has no place where the simulation's own are re-fitted."""

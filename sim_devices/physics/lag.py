@@ -80,8 +80,14 @@ def _ac_parts(settings: Settings) -> Parts:
         (
             Parameter("time_constant_s", "s", 2 * dt, 30 * span, log=True, scale=dt),
             Parameter("settled_share", "1", 0.0, 1.0, scale=0.1),
-        )
+        ),
+        (Parameter("zero", "{out}"),),
     )
+
+
+def _ac_zero(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    """Return the column (n, 1) of the reading of no signal: a zero in front of the high-pass is lost with the mean."""
+    return np.ones((ctx.t.size, 1))
 
 
 def _ac_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
@@ -104,14 +110,16 @@ def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Se
 
 
 def _twice_parts(settings: Settings) -> Parts:
-    time_constant, settled = _ac_parts(settings).nonlinear
+    once = _ac_parts(settings)
+    time_constant, settled = once.nonlinear
     # the names are unique, because twin files distinguish forms by their parameters
     return Parts(
         (
             replace(time_constant, name="period_by_2pi_s"),
             Parameter("damping_ratio", "1", 0.3, 3.0, log=True, scale=0.1),
             settled,
-        )
+        ),
+        once.weights,
     )
 
 
@@ -164,7 +172,9 @@ _ONCE = Effect(
     prepare=time_settings,
     guess=_ac_guess,
     apply=_ac_apply,
+    basis=_ac_zero,
     report=_report,
+    loses_mean=True,
 )
 _TWICE = replace(
     _ONCE,

@@ -121,8 +121,9 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     guess=_guess,
     basis=lambda x, ctx, q, settings: _columns(x, ctx.dt, q[0], settings, ctx.starts),
     report=_report,
-    # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it
-    limits={"change_with_speed": (0.08, np.inf)},
+    # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it; that of a
+    # lag is a fortieth as wide at a fortieth of the speed, and is no memory at rest
+    limits={"change_with_speed": (0.08, 0.95)},
     vanishes_with=(("loop_width_share_*",), ("change_with_speed",)),
     plain="hysteresis",
 )

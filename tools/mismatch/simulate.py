@@ -506,6 +506,12 @@ class Model:
                 inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], how)
         return inputs, [self.force(k, how.theta) for k in self.order if self.placed[k].site == "feedback"]
 
+    def driven(self, run: Run, theta: Array) -> Run:
+        """Return the run with its inputs as they are behind their effects."""
+        inputs, _ = self._driven(run, Pass(theta, True))
+        behind = {s: fold(x, theta).value for s, x in inputs.items() if s in run.signals}
+        return replace(run, signals={**run.signals, **behind}, memo={})
+
     def start_states(self, view: View, theta: Array) -> Array:
         """Return the states (s,) at the first sample of a free run of differential equations."""
         inside = inside_of(self.twin)
@@ -544,7 +550,10 @@ class Model:
         if effect.kind == "linear":
             apply = effect.apply
             assert apply is not None
-            return x.map(lambda v: apply(v, ctx, q, pl.settings), key)
+            through = apply
+            x = x.map(lambda v: through(v, ctx, q, pl.settings), key)
+            if effect.basis is None:
+                return x
         if effect.kind == "nonlinear":
             apply = effect.apply
             assert apply is not None
@@ -553,7 +562,7 @@ class Model:
             return Signal(value, {}, (*s.token, key))
         basis = effect.basis
         assert basis is not None
-        if effect.driven:
+        if effect.driven and effect.kind != "linear":
             around = {j: c for j, c in x.columns.items() if j in kept} if by is None else {}
             s = by if by is not None else replace(x, columns={j: c for j, c in x.columns.items() if j not in around})
             s = collapse(s)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from sim_devices.physics.effect import STAGES, Effect, Stage
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.cascade import between_of
+from tools.mismatch.twins.cascade import BETWEEN, between_of
 from tools.mismatch.twins.equations import Place
 from tools.mismatch.twins.opaque import OpaqueTwin
 
@@ -27,8 +27,17 @@ def sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Pl
     """
     out: list[Placed] = []
     for one in (effect, *effect.variants):
-        out += _sites(twin, recording, one, present)
+        out += [p for p in _sites(twin, recording, one, present) if _unit_fits(twin, p)]
     return out
+
+
+def _unit_fits(twin: Twin, place: Placed) -> bool:
+    """Return True if the effect may act on the unit of the signal at its place, where that is an end of the chain."""
+    return place.site == "feedback" or place.target == BETWEEN or _unit_fits_at(twin, place.effect)(place.target)
+
+
+def _unit_fits_at(twin: Twin, effect: Effect) -> Callable[[str], bool]:
+    return lambda signal: not effect.end_units or twin.units.get(signal, "") in effect.end_units
 
 
 def why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
@@ -50,6 +59,8 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return f"no {effect.position_unit or 'state'} that it could act on"
     if effect.sites == ("between",) and not between_of(twin):
         return "no place between two filters"
+    if effect.end_units and not between_of(twin) and not any(map(_unit_fits_at(twin, effect), twin.units)):
+        return f"no signal in {' or '.join(effect.end_units)}, and no place between two filters"
     missing = [s for s in effect.needs if s not in recording.signals]
     if missing:
         return f"{', '.join(missing)} not recorded"

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import lfilter
 
-from tests.unit.mismatch_engine.cases import recording
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.pose import prepared
+from tools.mismatch.infer import diagnose
 
 NOISE_C = 0.02
 
@@ -38,3 +41,16 @@ def test_a_constant_that_the_equations_have_is_left_to_them() -> None:
     found = block("(gain * command + ambient - displacement) / tau", numbers, 23.0, 0.0)
     assert abs(found["ambient"] - 23.0) < 0.01
     assert abs(found["displacement_offset"]) < 0.01
+
+
+def test_an_amplifier_that_loses_the_mean_has_a_zero_of_its_own() -> None:
+    """Behind columns, too: no parameter of the simulation that made them takes its response to a constant away."""
+    rng, rate_hz, tau_s = np.random.default_rng(3), 50.0, 1.9
+    x = 300.0 + 60.0 * np.repeat(rng.uniform(-1.0, 1.0, 60), 50) + 5.0 * wave(rng, 3000)
+    keep = (2 * tau_s * rate_hz - 1) / (2 * tau_s * rate_hz + 1)
+    passed = np.asarray(lfilter([(1 + keep) / 2, -(1 + keep) / 2], [1.0, -keep], x - x[0]))
+    y = 0.985 * passed + 0.6 + 0.3 * rng.standard_normal(x.size)
+    rec = recording("columns", {"simulated_level": x}, {"level": y}, {}, rate_hz=rate_hz)
+    report = diagnose(rec, jobs=1, effects=[EFFECTS[n] for n in ("ac_coupling", "thermal_drift", "creep")])
+    assert (report.verdict, [p.name for p in report.physics]) == ("missing_physics", ["ac_coupling"])
+    assert abs(report.physics[0].parameters["time_constant_s"].value - tau_s) < 0.01

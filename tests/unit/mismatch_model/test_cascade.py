@@ -82,13 +82,16 @@ def test_a_diode_between_the_filters_is_simulated_and_written_down() -> None:
     assert other.simulate(whole, values)["y"] == pytest.approx(y, abs=1e-6)
 
 
-def test_a_diode_is_offered_between_filters_and_nowhere_else() -> None:
+def test_a_diode_is_offered_between_filters_and_where_a_voltage_ends() -> None:
     u, y = circuit(400, 0.4)
     rec, diode = in_two(u, y), EFFECTS["one_sided_conduction"]
-    assert [(p.site, p.target) for p in sites(make(rec), rec, diode)] == [("input", BETWEEN)]
+    volts = [("output", "y"), ("input", "u"), ("input", BETWEEN)]
+    assert [(p.site, p.target) for p in sites(make(rec), rec, diode)] == volts
     one = recording("state_space", {"u": u}, {"y": y}, {**matrices(*SECOND, 1.0), "discrete": True})
-    assert sites(make(one), one, diode) == []
-    assert "between two filters" in why_not(make(one), one, diode)
+    assert [(p.site, p.target) for p in sites(make(one), one, diode)] == volts[:2]
+    pushed = replace(one, unit={"u": "N", "y": "mm"})
+    assert sites(make(pushed), pushed, diode) == []
+    assert "no signal in V" in why_not(make(pushed), pushed, diode)
 
 
 def test_a_corrected_twin_has_no_places_that_its_core_lacks() -> None:

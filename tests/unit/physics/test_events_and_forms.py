@@ -120,6 +120,9 @@ def test_memory_that_no_speed_changes_is_not_called_rate_dependent() -> None:
     assert still < low
     p[13] = 0.1  # the weight that grows with speed
     assert low < {h.name: h.value for h in effect.report(p, settings, 1.0)}["change_with_speed"] < high
+    lag = np.zeros(p.size)
+    lag[0], lag[-1] = 0.01, 1.0
+    assert {h.name: h.value for h in effect.report(lag, settings, 1.0)}["change_with_speed"] > high
 
 
 def test_a_dead_zone_beside_zero_is_one_only_where_the_response_comes_back() -> None:

@@ -51,10 +51,11 @@ def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[st
 def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
     """Return for each effect if a wrong parameter of the simulation can imitate it.
 
-    This holds for a linear effect behind columns of simulated output, whose parameters cannot be re-fitted here.
+    This holds for a linear effect behind columns of simulated output, whose parameters cannot be re-fitted here, unless
+    it takes the response to a constant away: no parameter of a simulation that has one does that.
     """
     columns = getattr(twin, "core", twin).kind == "columns"
-    linear = {name for name, effect in EFFECTS.items() if effect.is_linear}
+    linear = {name for name, effect in EFFECTS.items() if effect.is_linear and not effect.loses_mean}
     return [columns and p.name in linear for p in physics]
 
 

@@ -121,9 +121,9 @@ def _ac(s: Slot, x: str, d: str) -> str:
     if "period_by_2pi_s" in s.values:
         period, damping = s.at("period_by_2pi_s"), s.at("damping_ratio")
         slow = s.part("mode", f"1 / (2 * np.pi * {period}), {damping}, dt, settled={s.at('settled_share')}")
-        return f"{x} - np.array([1, 2 * {damping}]) @ {slow}({x})"
+        return f"{x} - np.array([1, 2 * {damping}]) @ {slow}({x}) + {s.at('zero')}"
     slow = s.part("low_pass", f"{s.at('time_constant_s')}, dt, settled={s.at('settled_share')}")
-    return f"{x} - {slow}({x})"
+    return f"{x} - {slow}({x}) + {s.at('zero')}"
 
 
 def _resonance(s: Slot, x: str, d: str) -> str:
