@@ -75,6 +75,62 @@ def test_a_stretch_that_starts_afresh_is_met_by_all_its_samples_and_by_no_other(
     assert left(beside, True) == pytest.approx(left(recording, True), rel=1e-6)
 
 
+def arm(folder: Path, noise_rad: float) -> Recording:
+    """An arm with gravity and friction that is larger at rest, by small steps; it sticks at every turn."""
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.uniform(-0.8, 0.8, 30), 40)
+    steps, angle, speed = 40, 0.0, 0.0
+    read = np.empty(u.size)
+    h = 1 / RATE_HZ / steps
+    for i in range(u.size):
+        read[i] = angle
+        for _ in range(steps):
+            push = 20.0 * u[i] - 7.5 * math.sin(angle) - 1.0 * speed
+            friction = 2.5 + 2.9 * math.exp(-((speed / 0.15) ** 2))
+            slowed = speed + h * push
+            # dry friction stops a body within the step and holds it up to its level
+            speed = math.copysign(max(abs(slowed) - h * friction, 0.0), slowed)
+            angle += h * speed
+    return recorded(folder, ARM, u, read + noise_rad * rng.standard_normal(u.size))
+
+
+ARM = """
+[twin]
+kind = "ode"
+
+[twin.states]
+angle = "rad"
+speed = "rad/s"
+
+[twin.equations]
+angle = "speed"
+speed = "gain * command - damping * speed"
+
+[twin.parameters]
+gain = 20.0
+damping = 1.0
+hold = "zero"
+"""
+
+
+def test_a_stretch_in_which_a_body_sticks_is_met(tmp_path: Path) -> None:
+    """A whole step of Gauss-Newton leads to another place of rest."""
+    recording = arm(tmp_path, 2e-3)
+    twin = make(recording)
+    (gravity,), (friction, *_) = (
+        sites(twin, recording, EFFECTS[name]) for name in ("gravity_load", "stribeck_friction")
+    )
+    model = Model(twin, [gravity, friction])
+    theta = model.start(recording)
+    names = [p.name for p in model.parameters]
+    known = {"sine": -7.5, "cosine": 0.0, "stribeck_speed": 0.15, "level": 2.5, "extra": 2.9}
+    for name, value in known.items():
+        theta[next(i for i, n in enumerate(names) if n.rsplit(".", 1)[-1] == name)] = value
+    view = View(recording, tuple((a, a + 100) for a in range(0, 1200, 100)), 20, afresh=True)
+    left = model.residual(view, theta)["angle"]
+    assert np.sqrt(np.mean(left**2)) < 1.2 * 2e-3
+
+
 def test_runs_of_one_search_start_near_each_other(tmp_path: Path) -> None:
     """They meet the recording as well as runs by themselves do, and change smoothly with the parameters."""
     recording, _ = pendulum(tmp_path)

@@ -230,6 +230,12 @@ def slopes_of(x0: Array, missed: Array, misses: Callable[[Array], Array], typica
     return np.stack([(missed - misses(x0 + way)) / STATE_STEP for way in ways], axis=-1)
 
 
+HALVINGS = 4
+"""Largest number of times that a step of start states is halved until it improves them."""
+WORTH_HALVING = 0.9
+"""Largest square of the misses that a step foretells, as a share of the present one, for which it is halved."""
+
+
 @np.errstate(over="ignore", invalid="ignore")  # a trial that runs away is no better
 def meet_start(
     x0: Array,
@@ -252,13 +258,21 @@ def meet_start(
     best = misses(x0)
     for _ in range(rounds):
         turn, foretold = start_step(slopes_of(x0, best, misses, typical), best, edges)
-        moved = np.clip(x0 + typical * turn, *limits)
-        after = misses(moved)
-        was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
-        better = now < was
-        x0 = np.where(better[:, None], moved, x0)
-        best = np.where(better[of][:, None], after, best)
+        was = now = together(np.sum(best**2, axis=1))
+        behind = np.ones(was.size, np.bool_)
+        for h in range(1 + HALVINGS):
+            moved = np.clip(x0 + typical * np.where(behind, 0.5**h, 0.0)[:, None] * turn, *limits)
+            after = misses(moved)
+            reached = together(np.sum(after**2, axis=1))
+            better = behind & (reached < was)
+            x0 = np.where(better[:, None], moved, x0)
+            best = np.where(better[of][:, None], after, best)
+            now = np.where(better, reached, now)
+            # where a body sticks, a step may lead to another place of rest; elsewhere a whole one is right
+            behind &= ~better & (foretold < WORTH_HALVING * was)
+            if not np.any(behind):
+                break
         # linear equations need a single step
-        if not np.any(better & (now < 0.999 * was) & (now > foretold + 0.001 * was)):
+        if not np.any((now < 0.999 * was) & (now > foretold + 0.001 * was)):
             break
     return x0
