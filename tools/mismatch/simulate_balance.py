@@ -8,15 +8,17 @@ linear in the weights of the force, and the twin's own parameters move with them
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 from scipy.signal import fftconvolve
 
 from sim_devices.physics.effect import Array, Context
 from sim_devices.physics.statistics import least_squares, thin
-from tools.mismatch.placed import Free, Placed
+from tools.mismatch.placed import Free
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Balance
@@ -69,29 +71,32 @@ def weighing(balance: Balance, dt: float, noise: float) -> Array | None:
 def balanced(model: Model, k: int, view: View, theta: Array, x: Array, ctx: Context) -> list[Array]:
     """Return theta with the force ``k`` of a model and the base parameters from the balance, at the force's guesses.
 
+    Other forces there are as they are, or move with it: beside a force that was missing they were fitted for two.
     ``x`` (n,) and ``ctx``: the course on which the force depends. Empty where not every state was recorded.
     """
     pl, twin = model.placed[k], model.twin
     if not isinstance(twin, DynamicTwin | OdeTwin) or pl.effect.basis is None:
         return []
-    run = view_run(twin, view)
+    run = model.driven(view_run(twin, view), theta)
     first = twin.balance(run, theta[: model.n_base], pl.target)
     weights = None if first is None else weighing(first, run.dt, noise_of(first.reading))
     if first is None or weights is None:
         return []
-    whole = minimum_filter1d(view.mask.astype(np.int8), weights.size + 2, mode="constant") > 0
-    for cut in view.recording.segments:
-        whole[max(cut - weights.size, 0) : cut + weights.size] = False
+    whole = within(view, weights)
     if np.count_nonzero(whole) < LEAST_ROWS:
         return []
 
     def weighed(y: Array) -> Array:
         return np.asarray(fftconvolve(y, weights, "same"), np.float64)
 
-    others = np.zeros(x.size)
-    for p in model.placed:
-        if p is not pl and p.site == "feedback" and p.target == pl.target:
-            others += _force(model, p, theta, x, ctx)
+    beside = [
+        j
+        for j, p in enumerate(model.placed)
+        if j != k and p.site == "feedback" and p.target == pl.target and p.effect.basis is not None
+    ]
+    forces = {j: force_columns(model, j, theta, x, ctx) for j in beside}
+    others = sum((c @ theta[model.slices(j)[1]] for j, c in forces.items()), np.zeros(x.size))
+    free = [forces] if forces and all(np.all(np.isfinite(c)) for c in forces.values()) else []
 
     def sides(balance: Balance) -> tuple[Array, Array]:
         slopes = np.stack([weighed(c) for c in balance.slopes.T], axis=1)
@@ -105,40 +110,58 @@ def balanced(model: Model, k: int, view: View, theta: Array, x: Array, ctx: Cont
         columns = pl.effect.basis(x, seen, np.asarray(q, np.float64), pl.settings)
         if not columns.shape[1] or not np.all(np.isfinite(columns)):
             continue
-        columns = np.stack([weighed(c) for c in columns.T], axis=1)
-        at = theta.copy()
-        own, _ = model.slices(k)
-        at[own] = q
-        balance: Balance | None = first
-        for r in range(ROUNDS):
-            # at numbers where the equations diverge, no state is known
-            balance = balance if r == 0 else twin.balance(run, at[: model.n_base], pl.target)
-            if balance is None:
-                break
-            missing, slopes = sides(balance)
-            if not (np.all(np.isfinite(missing)) and np.all(np.isfinite(slopes))):
-                break
-            found, _ = least_squares(np.column_stack([columns, slopes])[rows], missing[rows], 1e-9)
-            at = _moved(model, k, at, found)
-        else:
-            out.append(at)
+        for moving in [*free, dict[int, Array]()]:
+            every = {k: columns, **moving}
+            design = np.stack([weighed(c) for c in np.column_stack(list(every.values())).T], axis=1)
+            at = theta.copy()
+            own, _ = model.slices(k)
+            at[own] = q
+            balance: Balance | None = first
+            for r in range(ROUNDS):
+                # at numbers where the equations diverge, no state is known
+                balance = balance if r == 0 else twin.balance(run, at[: model.n_base], pl.target)
+                if balance is None:
+                    break
+                missing, slopes = sides(balance)
+                was = [theta[i] for j in moving for i in _weights(model, j)]
+                missing = missing + design[:, columns.shape[1] :] @ was
+                if not (np.all(np.isfinite(missing)) and np.all(np.isfinite(slopes))):
+                    break
+                found, _ = least_squares(np.column_stack([design, slopes])[rows], missing[rows], 1e-9)
+                at = _moved(model, list(every), at, found)
+            else:
+                out.append(at)
     return [at for at in out if np.all(np.isfinite(at))]
 
 
-def _force(model: Model, placed: Placed, theta: Array, x: Array, ctx: Context) -> Array:
-    """Return the force (n,) of another placed effect along the recorded course."""
+def within(view: View, weights: Array) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the samples around which the bump lies within the view and within one segment."""
+    whole = minimum_filter1d(view.mask.astype(np.int8), weights.size + 2, mode="constant") > 0
+    for cut in view.recording.segments:
+        whole[max(cut - weights.size, 0) : cut + weights.size] = False
+    return whole
+
+
+def _weights(model: Model, j: int) -> range:
+    """Return the places of the weights of placed effect ``j``."""
+    own = model.slices(j)[1]
+    return range(own.start, own.stop)
+
+
+def force_columns(model: Model, j: int, theta: Array, x: Array, ctx: Context) -> Array:
+    """Return the force per weight (n, k) of another placed effect along the recorded course."""
+    placed = model.placed[j]
     assert placed.effect.basis is not None
-    q, w = (theta[part] for part in model.slices(model.placed.index(placed)))
-    return placed.effect.basis(x, ctx, q, placed.settings) @ w
+    return placed.effect.basis(x, ctx, theta[model.slices(j)[0]], placed.settings)
 
 
-def _moved(model: Model, k: int, theta: Array, found: Array) -> Array:
-    """Return theta with the weights of force ``k`` and the shifts of the base parameters that were ``found``."""
+def _moved(model: Model, forces: Sequence[int], theta: Array, found: Array) -> Array:
+    """Return theta with the weights of ``forces`` and the shifts of the base parameters that were ``found``."""
     out = theta.copy()
-    _, weights = model.slices(k)
-    size = weights.stop - weights.start
-    out[weights] = found[:size]
-    for i, shift in enumerate(found[size:].tolist()):
+    places = [i for j in forces for i in _weights(model, j)]
+    for i, value in zip(places, found.tolist(), strict=False):
+        out[i] = min(max(value, model.parameters[i].lo), model.parameters[i].hi)
+    for i, shift in enumerate(found[len(places) :].tolist()):
         out[i] = shifted(model.parameters[i], theta[i], shift)
     return out
 

@@ -13,6 +13,7 @@ from tools.mismatch.engine.linearised import fit_beside
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, compare, misfits
 from tools.mismatch.engine.screen import Candidate, Ground, bend, is_wide, one_step
+from tools.mismatch.engine.vary import with_balance
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
@@ -109,8 +110,9 @@ def fit_one(
         fitted = fit_beside(problem, model, current, ground, candidate.starts, hopeless=limit)
         return Trial(candidate.placed, candidate, fitted, compare(problem, current, fitted), misfits(problem, fitted))
     thin = max(effort.stride, rows.size * len(now) // TRIAL_ROWS)
+    begin = with_balance(problem, model, candidate.starts)
     fitted = fit(
-        problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
+        problem, model, begin, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
         keep=current, touched=touched,
     )  # fmt: skip
     comparison = compare(problem, current, fitted)

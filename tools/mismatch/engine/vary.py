@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from sim_devices.physics.effect import Array
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_joint import in_balance
 from tools.mismatch.simulate_start import prepare, starts
 
 
@@ -36,8 +38,14 @@ def added(problem: Problem, current: Fit, place: Placed) -> Fit:
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
-    begin = starts(model, len(model.placed) - 1, problem.fit_view, theta)
+    begin = with_balance(problem, model, starts(model, len(model.placed) - 1, problem.fit_view, theta))
     return fit(problem, model, begin, stride=2, iterations=12, keep=current, touched=placed.outputs)
+
+
+def with_balance(problem: Problem, model: Model, begin: Sequence[Array]) -> list[Array]:
+    """Return the starts of a set of two or more effects, led by the first one fitted to the equations of motion."""
+    together = in_balance(model, problem.fit_view, begin[0]) if len(model.placed) > 1 else None
+    return [*begin] if together is None else [together, *begin]
 
 
 def beyond_limits(fitted: Fit, placed: Placed) -> bool:

@@ -15,7 +15,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
-from tools.mismatch.engine.vary import added, beyond_limits, size, stripped
+from tools.mismatch.engine.vary import added, beyond_limits, size, stripped, with_balance
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.density import (
@@ -246,7 +246,8 @@ class Store:
         for target, source in own:
             theta[target] = one.fitted.theta[source]
         with np.errstate(all="ignore"):
-            return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
+            begin = with_balance(self.problem, model, [theta])
+            return self.put(fit(self.problem, model, begin, stride=2, iterations=12))
 
     def refined(self, s: Scored) -> Scored:
         """Return the set fitted on every row until convergence."""

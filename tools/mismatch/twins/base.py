@@ -247,7 +247,7 @@ class Balance:
 
     ``rate`` (n,) is the derivative of the ``order`` (1 or 2) of the ``reading`` (n,), by central differences; ``model``
     (n,) is the same by the equations without forces, and ``slopes`` (n, k) are its derivatives with respect to the base
-    parameters.
+    parameters. ``at`` returns the model's side at other base parameters and signals.
     """
 
     reading: Array
@@ -255,6 +255,7 @@ class Balance:
     rate: Array
     model: Array
     slopes: Array
+    at: Callable[[Array, Mapping[str, Array]], Array]
 
 
 def central_difference(x: Array, dt: float, order: int) -> Array:

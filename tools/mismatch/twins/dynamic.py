@@ -131,10 +131,17 @@ class DynamicTwin(Head):
         assert reading is not None
         v = central_difference(reading, run.dt, 1) if v is None else v
         x = travelled(v, run.dt, self.counted or "start") if x is None else x
-        drive = self.inputs[0]
-        slopes = self.motion_of(x, v, midway(run.signals[drive], self.holds[drive] == "zero"))
+        drive, motion, position, velocity = self.inputs[0], self.motion_of, x, v
+
+        def slopes(signals: Mapping[str, Array]) -> Array:
+            return motion(position, velocity, midway(signals[drive], self.holds[drive] == "zero"))
+
+        def at(theta: Array, signals: Mapping[str, Array]) -> Array:
+            columns = slopes(signals)
+            return columns @ theta[: columns.shape[1]]
+
         rate = central_difference(reading, run.dt, order)
-        return Balance(reading, order, rate, slopes @ theta[: slopes.shape[1]], slopes)
+        return Balance(reading, order, rate, at(theta, run.signals), slopes(run.signals), at)
 
     def _gain_index(self, signal: str) -> int:
         js = {link.j for link in self.links if link.source == signal}

@@ -197,7 +197,10 @@ class OdeTwin(Head):
         return tuple(found)
 
     def _courses(self, run: Run, theta: Array, states: Sequence[int]) -> list[tuple[Array, bool]]:
-        """Return the courses (n,) of states, and if an output reads them: then as recorded, else as simulated."""
+        """Return the courses (n,) of states, and if an output reads them: then as recorded, else as simulated.
+
+        An output reads a state if nothing but a factor and a zero is between them.
+        """
         x = self._simulated(run, {s: run.signals[s] for s in self.signals}, theta, ())
         c = self.linearised(self.values(theta)).c
         found: list[tuple[Array, bool]] = []
@@ -205,8 +208,10 @@ class OdeTwin(Head):
             y, recorded = x[:, i], False
             for k, o in enumerate(self.outputs):
                 alone = c[k, i] != 0.0 and np.count_nonzero(c[k]) == 1
-                if alone and np.allclose(self.readings(x, run, theta)[:, k], c[k, i] * y, rtol=1e-9, atol=1e-12):
-                    y, recorded = run.measured[o] / c[k, i], True
+                beside = self.readings(x, run, theta)[:, k] - c[k, i] * y if alone else y
+                zero = float(beside[0])
+                if alone and np.allclose(beside, zero, rtol=0.0, atol=1e-12 + 1e-9 * float(np.max(np.abs(x[:, i])))):
+                    y, recorded = (run.measured[o] - zero) / c[k, i], True
                     break
             found.append((np.ascontiguousarray(y), recorded))
         return found
@@ -229,17 +234,18 @@ class OdeTwin(Head):
         if not all(recorded) or place.target != place.velocity:
             return None
         reading = np.ascontiguousarray(x[:, place.velocity if order == 1 else place.position])
-        u = np.column_stack([midway(run.signals[s], h) for s, h in zip(self.signals, self.held.tolist(), strict=True)])
 
-        def modelled(theta: Array) -> Array:
+        def at(theta: Array, signals: Mapping[str, Array]) -> Array:
+            u = np.column_stack([midway(signals[s], h) for s, h in zip(self.signals, self.held.tolist(), strict=True)])
             return self.equations.rates_along(x, u, run.t, self.values(theta))[:, place.target]
 
-        model, slopes = modelled(theta), list[Array]()
+        model, slopes = at(theta, run.signals), list[Array]()
         for i in range(len(self.free)):
             moved = theta.copy()
             moved[i] += 1e-4 * (abs(theta[i]) or abs(self.parameters[i].scale) or 1.0)
-            slopes.append((modelled(moved) - model) / (moved[i] - theta[i]))
-        return Balance(reading, order, central_difference(reading, run.dt, order), model, np.column_stack(slopes))
+            slopes.append((at(moved, run.signals) - model) / (moved[i] - theta[i]))
+        rate = central_difference(reading, run.dt, order)
+        return Balance(reading, order, rate, model, np.column_stack(slopes), at)
 
     # -- simulation -----------------------------------------------------------------------------------
 
