@@ -25,6 +25,10 @@ MOVES = 5
 """Largest number of extended sets besides the base; each costs a screen of the whole vocabulary."""
 SWAPS = 2
 """Number of rounds in which every effect of the best set is removed and a better one is sought beside the others."""
+REPLACEMENTS = 3
+"""Number of sets that are extended to find an effect in place of one of the best set."""
+WORTH_REPLACING = 0.5
+"""Least gain that the best set leaves to one with another effect in place of one of its own, in prices of a name."""
 RIVALS = 3
 """Number of names tried in place of each name of the best set, and beside it on each output that it does not change."""
 FITS, FITS_LATER = (3, 6), (2, 4)
@@ -64,6 +68,7 @@ class Search:
         self.ground = ground_of(problem, base)
         self.expanded: set[Key] = set()
         self.moves = moves
+        self.replacements = REPLACEMENTS
         self.idle = 0
         self.stride = max(1, problem.fit_rows.size // 12000)
         c = constants
@@ -98,6 +103,8 @@ class Search:
                 break
             self.swap(best)
             if self.store.ranked()[0].key == best.key:
+                self.replace(best)
+            if self.store.ranked()[0].key == best.key:
                 break
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
@@ -114,6 +121,29 @@ class Search:
                 self.store.without(best, lambda p, n=name: p.effect.name == n)
             if self.store.ranked()[0].key == best.key:
                 return best
+
+    def replace(self, best: Scored) -> None:
+        """Extend what is left of ``best`` without each name in turn, until another effect does better in its place.
+
+        What belongs beside the other names may not even pass the screen beside the base, if they explain most.
+        """
+        c = self.store.constants
+        spare = c.per_name * (len(best.names) - 2) + c.per_parameter * (best.parameters - len(best.names))
+        if self.most_gain(best) + spare < WORTH_REPLACING * c.per_name:
+            return
+        rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in sorted(best.names)]
+        for rest in sorted(rests, key=lambda s: -self.store.score(s)):
+            if rest.key in self.expanded or not self.replacements:
+                continue
+            self.replacements -= 1
+            self.expand(rest)
+            grown = [s for s in self.store.ranked() if rest.names < s.names and len(s.names) == len(rest.names) + 1]
+            for s in grown[: RIVALS + 1]:
+                # beside a right name another may be one that stood for it
+                for name in sorted(rest.names):
+                    self.store.without(s, lambda p, n=name: p.effect.name == n)
+            if self.store.ranked()[0].key != best.key:
+                return
 
     def best_without(self, best: Scored, name: str) -> Scored:
         """Return the best set without ``name``: a beam of sets that share their first name grows no other account."""
