@@ -97,7 +97,10 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
     believed[: model.n_base] = given
     without = rest.carry(model, believed, view.recording)
     x, ctx = probe_signals(rest, view, without, pl, pl.outputs[0])
-    guesses = pl.effect.guess(x, full_residual(rest, view, without, pl.outputs[0]), ctx, pl.settings)
+    residual = full_residual(rest, view, without, pl.outputs[0])
+    if not np.all(np.isfinite(residual)):
+        return []  # beside the effects present that base runs away
+    guesses = pl.effect.guess(x, residual, ctx, pl.settings)
     own = [believed.copy() for _ in guesses[:2]]
     for th, q in zip(own, guesses, strict=False):
         th[a] = q
