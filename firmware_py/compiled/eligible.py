@@ -15,6 +15,8 @@ from hal.errors import BenchError
 IN_TICK = ("daq", "output")
 """Roles of the devices that every tick reads or writes. Others are polled by Python beside the thread."""
 AXES = 6
+INJECTED = "--inject is Python between the loop and a device"
+"""Why a run with injected faults cannot be compiled."""
 
 
 def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = False) -> list[str]:
@@ -40,7 +42,7 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
     if pace != "realtime":
         reasons.append("emulated time passes in Python (--realtime runs on the wall clock)")
     if injected:
-        reasons.append("--inject is Python between the loop and a device")
+        reasons.append(INJECTED)
     return reasons
 
 

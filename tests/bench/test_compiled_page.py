@@ -138,6 +138,18 @@ def test_a_compiled_run_is_shown_recorded_and_ended_by_the_safe_button(server: S
 
 
 @pytest.mark.realtime
+def test_the_command_starts_the_page_with_a_compiled_run() -> None:
+    more = "\n[firmware.safety]\nholds_per_minute = 60\n"
+    with bench_server(more, options=("--realtime", "--compiled", "--stale-ms", "300")) as server:
+        assert server.state()["compiled"]
+        assert server.request("POST", "/api/safe", b"{}")[0] == 200
+        server.wait_for(lambda s: s["phase"] == "safe", "the safe state")
+        outcome = last_outcome(server)
+    assert outcome["loop"]["kind"] == "compiled"
+    assert outcome["clock"] == "real"
+
+
+@pytest.mark.realtime
 def test_a_page_that_is_killed_leaves_the_outputs_of_a_compiled_run_at_neutral() -> None:
     """The firmware ends as it does on SIGTERM when its server has gone, and nobody waits for it."""
     with bench_server(options=("--stale-ms", "300")) as server:

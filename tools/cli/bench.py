@@ -8,15 +8,17 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from firmware_py.compiled.eligible import check_compiled
 from firmware_py.endoscope.wiring import is_endoscope
-from hal.bench import load_bench
-from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, SeedOption, bench_path
+from hal.bench import check_pace, load_bench
+from tools.cli.bench_option import BenchOption, CompiledOption, HandOption, RealtimeOption, SeedOption, bench_path
 from tools.cli.common import clear_errors, console
 from tools.cli.run_watch import RateOption, ReferenceOption, WatchOption, check_twin, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_names
 from tools.prepare import prepare
+from tools.reports.loop_lines import loop_lines
 
 
 def bench(
@@ -48,6 +50,7 @@ def bench(
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
     realtime: RealtimeOption = False,
+    compiled: CompiledOption = False,
 ) -> None:
     """Run the instrument and serve the bench page for it, until Ctrl-C.
 
@@ -64,6 +67,9 @@ def bench(
         if watch is not None:
             decide_on([watch], trust, allow_outside)
         description = load_bench(file)
+        pace = check_pace(description, "realtime" if realtime else None)
+        if compiled:
+            check_compiled(description, pace)
         watching = watch_settings(description, watch, watch_reference, false_alarms_per_hour)
         if watching is not None:
             check_twin(watching, description)
@@ -83,5 +89,7 @@ def bench(
                 soft_wrap=True,
             )
 
-        choice = Choice(file, hand, None, seed, stale_ms, pace="realtime" if realtime else None)
+        for line in loop_lines(description, pace, compiled=compiled):
+            console().print(line)
+        choice = Choice(file, hand, None, seed, stale_ms, pace="realtime" if realtime else None, compiled=compiled)
         serve(choice, recordings.absolute(), sock, announce, names=tuple(host_name or ()), watch=watching)

@@ -24,6 +24,9 @@ RealtimeOption = Annotated[
         "--realtime", help="Emulated bench: run on the wall clock, with the devices in processes of their own."
     ),
 ]
+CompiledOption = Annotated[
+    bool, typer.Option("--compiled", help="Run the ticks in one compiled thread without the interpreter.")
+]
 HandOption = Annotated[
     str | None,
     typer.Option(

@@ -11,12 +11,14 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
+from firmware_py.compiled.eligible import check_compiled
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
+from tools.reports.loop_lines import loop_lines
 from tools.terminal import table_of
 
 YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask before devices are touched.")]
@@ -140,6 +142,7 @@ def scope(
 
 
 def latency(
+    *,
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="Length of each measurement.")] = 5.0,
     hours: Annotated[
@@ -150,6 +153,9 @@ def latency(
         PolicyChoice | None, typer.Option(help="Scheduling policy to measure; default both, fifo with --hours.")
     ] = None,
     firmware: Annotated[bool, typer.Option(help="Measure the firmware too, on the bench.")] = True,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="Run the firmware's ticks in its compiled thread, not in Python.")
+    ] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Measure how late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.
@@ -168,7 +174,14 @@ def latency(
     with clear_errors():
         check_writable(json_file)
         path = bench_path(bench)
-        load_bench(path)
+        file = load_bench(path)
+        if compiled and not firmware:
+            raise InputError("--compiled is how the firmware is measured, and --no-firmware leaves it out; give one")
+        if compiled:
+            check_compiled(file, "realtime")
+        if firmware:
+            for line in loop_lines(file, "realtime", compiled=compiled, label="firmware:"):
+                console().print(line)
         chosen = policy or (PolicyChoice.BOTH if hours is None else PolicyChoice.FIFO)
         every: tuple[Policy, ...] = ("other", "fifo")
         policies: list[Policy] = [p for p in every if chosen is PolicyChoice.BOTH or p == chosen.value]
@@ -179,7 +192,10 @@ def latency(
             loop
             for p in policies
             for loop in loops_of(
-                p, reference if isinstance(reference, CReference) else None, path if firmware else None
+                p,
+                reference if isinstance(reference, CReference) else None,
+                path if firmware else None,
+                compiled=compiled,
             )
         ]
         turn_s = seconds if hours is None else min(TURN_S, 3600.0 * hours / len(loops))

@@ -21,7 +21,7 @@ from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
 
-from firmware_py.compiled.eligible import check_compiled, check_spin
+from firmware_py.compiled.eligible import INJECTED, check_compiled, check_spin
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
@@ -30,13 +30,22 @@ from firmware_py.run_request import RunRequest
 from firmware_py.tremor.config import Method, all_methods, why_unknown
 from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
-from tools.cli.bench_option import BenchOption, HandOption, RealtimeOption, ScaleOption, SeedOption, bench_path
+from tools.cli.bench_option import (
+    BenchOption,
+    CompiledOption,
+    HandOption,
+    RealtimeOption,
+    ScaleOption,
+    SeedOption,
+    bench_path,
+)
 from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture
 from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
 from tools.prepare import prepare
+from tools.reports.loop_lines import loop_lines
 
 if TYPE_CHECKING:
     from tools.mismatch.watch.live import Settings
@@ -58,9 +67,7 @@ def run(
         bool, typer.Option("--virtual", help="Emulated bench: run as fast as possible, not a second per second.")
     ] = False,
     realtime: RealtimeOption = False,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Run the ticks in one compiled thread without the interpreter.")
-    ] = False,
+    compiled: CompiledOption = False,
     spin_us: Annotated[
         float, typer.Option(min=0.0, help="With --compiled: poll without sleeping for so many us around each scan.")
     ] = 0.0,
@@ -167,8 +174,12 @@ def run(
         if not is_endoscope(file.description):
             from tools.reports.run_live import opening_lines
 
-            for line in opening_lines(file, seconds, pace, hand, seed, compiled):
+            for line in opening_lines(file, seconds, pace, hand, seed):
                 console().print(line)
+        orders = _orders_in_python(inject=bool(inject), sense_only=sense_only, manual=manual is not None)
+        for line in loop_lines(file, pace, compiled=compiled, orders=orders):
+            console().print(line)
+        if not is_endoscope(file.description):
             prepare(file, request.method, console())
         beside = None if watching is None else _open_watch(watching, file, request)
         outcome, truth = _run_real(request, beside) if pace == "realtime" else _run_emulated(request, beside)
@@ -188,6 +199,16 @@ def run(
             steps = [*lines(found), *steps]
         write_report(result, truth, console(), json_file=json_file, html=html, image=image, more=steps)
         raise typer.Exit(exit_status(result))
+
+
+def _orders_in_python(*, inject: bool, sense_only: bool, manual: bool) -> list[str]:
+    """Return why the options of a run keep its ticks in Python."""
+    reasons = {
+        INJECTED: inject,
+        "--sense-only moves no outputs, and the compiled thread runs while they move": sense_only,
+        "--manual plays voltages in the Python loop": manual,
+    }
+    return [why for why, is_asked in reasons.items() if is_asked]
 
 
 def _check_processor(pace: str, cpu: int | None) -> None:

@@ -21,12 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.frame import LAYOUT
+from firmware_py.layouts import layout_of
 from firmware_py.live.memory import LiveMemory
 from firmware_py.machine.workers import WORKER_PRIORITY
 from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
+from hal.bench import load_bench
 from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
 from hal.errors import HalError
@@ -99,9 +100,9 @@ class Loop:
     measure: Callable[[float, DurationHistogram], str]
 
 
-def loops_of(policy: Policy, reference: CReference | None, bench: Path | None) -> list[Loop]:
+def loops_of(policy: Policy, reference: CReference | None, bench: Path | None, *, compiled: bool = False) -> list[Loop]:
     """Return the loops that are compared under ``policy``: in C where there is a ``reference``, compiled, in Python,
-    with a pty, and the firmware on ``bench`` where one is given."""
+    with a pty, and the firmware on ``bench`` where one is given. ``compiled``: its ticks run in the compiled thread."""
 
     def woken(wake: Wake) -> Callable[[float, DurationHistogram], str]:
         return lambda seconds, histogram: wake_loop(wake, seconds, policy, histogram)
@@ -116,7 +117,8 @@ def loops_of(policy: Policy, reference: CReference | None, bench: Path | None) -
         Loop("loop and pty", policy, python(True)),
     ]
     if bench is not None:
-        loops.append(Loop("firmware", policy, partial(firmware_loop, bench, policy)))
+        what = "firmware, compiled" if compiled else "firmware"
+        loops.append(Loop(what, policy, partial(firmware_loop, bench, policy, compiled=compiled)))
     return loops
 
 
@@ -206,17 +208,20 @@ class _PtyEcho:
         os.close(self._master)
 
 
-def firmware_loop(bench: Path, policy: Policy, seconds: float, histogram: DurationHistogram) -> str:
+def firmware_loop(
+    bench: Path, policy: Policy, seconds: float, histogram: DurationHistogram, *, compiled: bool = False
+) -> str:
     """Count how late the firmware's ticks are on ``bench``, in a process of its own. Return the scheduling. Raises
     ``HalError`` when it cannot run."""
-    memory = LiveMemory.create(LAYOUT.size)
+    memory = LiveMemory.create(layout_of(load_bench(bench).description).size)
     local, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     fds = (memory.fd, remote.fileno())
     try:
         with tempfile.TemporaryDirectory(prefix="micron-") as folder:
             request = RunRequest(
-                bench, seconds, live_fds=fds, truth_s=1.0, stale_ms=1000.0, pace="realtime", policy=policy == "fifo"
-            )
+                bench, seconds, live_fds=fds, truth_s=1.0, stale_ms=1000.0, pace="realtime", policy=policy == "fifo",
+                compiled=compiled,
+            )  # fmt: skip
             request_file = Path(folder) / "request.json"
             request_file.write_text(request.to_json(Path(folder)), encoding="utf-8")
             command = child_command("firmware_py.app", str(request_file))

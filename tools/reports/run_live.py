@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled.eligible import reasons_against_bench
 from firmware_py.designs import design
 from hal.bench import BenchFile, OpenBench
 from hal.clock import Pace, VirtualClock
@@ -27,9 +26,7 @@ PACES: Mapping[Pace, str] = {
 }
 
 
-def opening_lines(
-    bench: BenchFile, seconds: float, pace: Pace, hand: str | None, seed: int | None, compiled: bool = False
-) -> list[str]:
+def opening_lines(bench: BenchFile, seconds: float, pace: Pace, hand: str | None, seed: int | None) -> list[str]:
     """Describe the run that is about to start, in lines of at most 80 columns."""
     description = bench.description
     emulated, n_buses = len(description.emulated_buses()), len(description.bus)
@@ -40,19 +37,7 @@ def opening_lines(
         lines.append(f"hand:  {hand or 'synthetic'}, seed {shown_seed}")
     lines.append(f"run:   {seconds:g} s after the self-test")
     lines.append(f"pace:  {PACES[pace]}")
-    if pace == "realtime":
-        lines += _loop_lines(bench, pace, compiled)
     return [line if len(line) <= 80 else line[:79] + "…" for line in lines]
-
-
-def _loop_lines(bench: BenchFile, pace: Pace, compiled: bool) -> list[str]:
-    """Say what runs the ticks and, where that must be Python, why."""
-    if compiled:
-        return ["loop:  one compiled thread, Python beside it"]
-    reasons = reasons_against_bench(bench, pace)
-    if not reasons:
-        return ["loop:  Python; --compiled runs it without the interpreter"]
-    return ["loop:  Python, because not every device can run compiled:", *(f"       {reason}" for reason in reasons)]
 
 
 class TipWatch:

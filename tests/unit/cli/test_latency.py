@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from firmware_py.scheduler.histogram import DurationHistogram
+from tests.conftest import DEFAULT_BENCH
 from tools.diagnose.c_reference import COMPILERS, CReference, compile_reference
-from tools.diagnose.latency import Lateness, Loop, loops_of, take_turns
+from tools.diagnose.latency import Lateness, Loop, firmware_loop, loops_of, take_turns
 from tools.diagnose.latency_tables import figures_table, histogram_table
 from tools.diagnose.wake_kernel import wake
 
@@ -83,12 +84,13 @@ def text_of(make: Callable[[list[Lateness]], Table], found: list[Lateness]) -> s
     return console.export_text()
 
 
-def test_the_tables_of_many_hours_fit_on_eighty_columns():
+@pytest.mark.parametrize("firmware", ["firmware", "firmware, compiled"])
+def test_the_tables_of_many_hours_fit_on_eighty_columns(firmware: str):
     histogram = counted([900, 12_000, 40_000, 130_000, 12_345_678])
     histogram.words[4 + 200] += 604_800_000
     found = [
         Lateness(what, "fifo", "", histogram)
-        for what in ("C reference", "compiled loop", "bare loop", "loop and pty", "firmware")
+        for what in ("C reference", "compiled loop", "bare loop", "loop and pty", firmware)
     ]
     figures = text_of(figures_table, found)
     assert "604800005" in figures
@@ -113,3 +115,19 @@ def test_the_loops_in_c_and_compiled_never_wake_early():
         wakes(late_ns, 1000, 0)  # due long ago: at once, then at times that are yet to come
         assert late_ns[0] > 0
         assert np.all(late_ns >= 0)
+
+
+def test_the_firmware_of_a_bench_is_measured_in_python_or_compiled():
+    def names(*, compiled: bool) -> list[str]:
+        return [loop.what for loop in loops_of("other", None, DEFAULT_BENCH, compiled=compiled)][3:]
+
+    assert names(compiled=False) == ["firmware"]
+    assert names(compiled=True) == ["firmware, compiled"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(("bench", "compiled"), [("endoscope", False), ("micron-e727", True)])
+def test_the_firmware_of_either_instrument_counts_its_ticks(bench: str, compiled: bool):
+    histogram = DurationHistogram()
+    firmware_loop(DEFAULT_BENCH.with_name(f"{bench}.toml"), "other", 0.5, histogram, compiled=compiled)
+    assert histogram.n > 0

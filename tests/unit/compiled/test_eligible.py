@@ -94,6 +94,59 @@ def test_asked_for_it_is_bad_input(tmp_path: Path, bench: str, what: str):
     assert not record.exists()
 
 
+@pytest.mark.parametrize("command", [["bench", "--realtime"], ["latency"]], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    ("bench", "what"),
+    [
+        ("micron-eight", "device.acc1, device.acc2, device.acc3, device.acc4: 8 accelerometer axes"),
+        ("endoscope", "an endoscope's loop is Python"),
+        ("NI", "device.daq: its driver nidaqmx has no kernels on bytes; device.piezo: its driver nidaqmx_ao has no"),
+    ],
+)
+def test_asked_for_it_is_bad_input_of_every_command(tmp_path: Path, command: list[str], bench: str, what: str):
+    file = str(bench_of_ni(tmp_path) if bench == "NI" else BENCHES / f"{bench}.toml")
+    made = tmp_path / "made"
+    own = ["--recordings", str(made)] if command[0] == "bench" else ["--json", str(made)]
+    result = CliRunner().invoke(app, [*command, "--bench", file, "--compiled", *own])
+    assert result.exit_code == 2
+    assert f"micron: {file}: --compiled cannot run: " in " ".join(result.output.split())
+    assert what in " ".join(result.output.split())
+    assert not made.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["bench", "--compiled"], "--compiled cannot run: emulated time passes in Python (--realtime runs on"),
+        (["latency", "--compiled", "--no-firmware"], "--no-firmware leaves it out"),
+    ],
+)
+def test_what_excludes_it_is_bad_input_of_every_command(words: list[str], what: str):
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
+    assert what in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--inject", "daq0:loss=0.001"], "--inject is Python between the loop and a device"),
+        (["--sense-only"], "--sense-only moves no outputs, and the compiled thread runs while they move"),
+    ],
+)
+def test_a_run_says_which_of_its_options_keeps_it_in_python(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], why: str
+):
+    def stop(*_: object) -> None:
+        raise BenchError("the run is not part of this test")
+
+    monkeypatch.setattr("tools.cli.run.prepare", stop)
+    result = CliRunner().invoke(app, ["run", "--realtime", "--bench", str(BENCHES / "micron.toml"), *words])
+    said = " ".join(result.output.split())
+    assert f"loop: Python, because this run cannot be compiled: {why} micron:" in said
+    assert "--compiled runs it" not in said
+
+
 @pytest.mark.parametrize(
     ("words", "what"),
     [
