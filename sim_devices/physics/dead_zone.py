@@ -76,6 +76,8 @@ DEAD_ZONE = Effect(
     report=_dead_report,
     # a slope gained inside makes a limit of it; one that is lost whole scatters about 1
     limits={"slope_lost_inside": (0.0, 1.1), "response_beyond": (LEAST_BEYOND, 1.0)},
+    # a narrow zone holds few samples: width times slope is certain, and neither of them
+    estimated=("slope_lost_inside",),
     vanishes_with=(("half_width",), ("slope_lost_inside",)),
     essential=("half_width",),
 )

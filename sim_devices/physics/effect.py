@@ -283,6 +283,11 @@ class Effect:
     """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect is absent when every
     parameter of any one group is zero, so it is named only where the data exclude that. Empty: one group of all.
     """
+    estimated: tuple[str, ...] = ()
+    """Those of ``limits`` that scatter with the noise: such a parameter is outside only where its 95 % interval is."""
+    curve_weights: Callable[[Settings], int] | None = None
+    """(settings) -> number of the last weights, which are a curve without memory beside the effect. They alone do not
+    show the effect. None: there are none."""
     essential: tuple[str, ...] = ()
     """Searched parameters that the effect needs: it is not named when one ends at its bound."""
     plain: str = ""

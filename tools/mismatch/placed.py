@@ -33,6 +33,11 @@ class Placed:
         return self.effect.parts(self.settings)
 
     @property
+    def curve_weights(self) -> int:
+        """Return the number of the last weights, which are a curve without memory beside the effect."""
+        return self.effect.curve_weights(self.settings) if self.effect.curve_weights is not None else 0
+
+    @property
     def label(self) -> str:
         """Return a name for parameter lists and logs, e.g. ``creep[displacement]``."""
         return f"{self.effect.name}[{self.target}]"

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Context
+from sim_devices.physics.hysteresis import CURVES, FORMS
 from tests.unit.mismatch_engine.cases import RATE, among, named, recording, wave
 from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero
 from tools.mismatch.engine.intervals import uncertainty
@@ -184,3 +188,53 @@ def test_a_curve_that_trades_with_a_gain_is_sure_as_a_whole() -> None:
     names, withheld, _ = weighed(made, "static_nonlinearity")
     assert names == {"static_nonlinearity"}
     assert not withheld
+
+
+STACK: dict[str, object] = {"gain_um_per_V": 0.12, "offset_um": 0.0}
+
+
+def moved_stack(change: np.ndarray, volts: np.ndarray, noise: float) -> Recording:
+    """A stack whose displacement (n,) has a ``change`` and white noise beside its gain."""
+    um = 0.12 * volts + change + np.random.default_rng(0).normal(0, noise, volts.size)
+    return recording("piezo_stack", {"command": volts}, {"displacement": um}, STACK)
+
+
+@pytest.mark.parametrize("seed", [1, 3, 12])
+def test_a_zone_too_narrow_for_its_slope_is_still_one(seed: int) -> None:
+    """Width times slope is certain; the slope alone was estimated at 1.2 to 1.7 of what can be lost."""
+    volts = 50.0 * wave(np.random.default_rng(seed), 3000, low=0.3, high=6.0)
+    made = moved_stack(-0.12 * np.clip(volts, -0.3, 0.3), volts, 0.03)
+    names, withheld, store = weighed(made, "dead_zone")
+    assert (names, withheld) == ({"dead_zone"}, ())
+    (zone,) = (s for s in store.sets.values() if s.placed)
+    lost = {h.name: h.value for h in zone.fitted.model.human(zone.fitted.theta)[zone.placed[0].label]}
+    assert lost["slope_lost_inside"] > EFFECTS["dead_zone"].limits["slope_lost_inside"][1]
+    assert zone.proper
+
+
+@pytest.mark.parametrize("loop", [0.0, 0.02])
+def test_a_curve_beside_stops_does_not_show_a_loop(loop: float) -> None:
+    """The weights of stops and curve were jointly certain by the curve alone, and a curve was named hysteresis."""
+    volts = 40.0 * wave(np.random.default_rng(0), 3000, low=0.3, high=6.0)
+    behind, p = np.empty(volts.size), volts[0]
+    for i, v in enumerate(volts):
+        behind[i] = p = max(v - 10.0, min(v + 10.0, p))
+    z = volts / 40.0
+    made = moved_stack(0.06 * (np.exp(z) - 1.0 - z) + loop * 0.12 * (behind - volts), volts, 0.015)
+    problem, _, base = prepared(made, 0.3, 0, False)
+    place = places(problem, [EFFECTS["hysteresis"]], ())[0]
+    form = float(FORMS.index("stops_curved"))
+
+    def prepare(x: np.ndarray, residual: np.ndarray, ctx: Context) -> dict[str, tuple[float, ...]]:
+        found = dict(EFFECTS["hysteresis"].prepare(x, residual, ctx))
+        return {k: v for k, v in found.items() if k in ("range", "rest")} | {"form": (form,), "sign": (-1.0,)}
+
+    bent = replace(place, effect=replace(place.effect, prepare=prepare))
+    store = Store(problem, base, learned())
+    with np.errstate(all="ignore"):
+        one = store.with_one(store.base, bent)
+        unsure = uncertainty(problem, one.fitted)
+    weights = one.fitted.model.slices(0)[1]
+    memory = unsure.chance_of_none(0, weights.stop - weights.start - one.placed[0].curve_weights)
+    assert one.placed[0].curve_weights == CURVES
+    assert (memory < 0.05) == (loop > 0.0)

@@ -64,7 +64,7 @@ def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsu
         return Doubt(k, "at_limit", stuck)
     own, weights = fitted.model.slices(k)
     whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1
-    if whole and unsure.chance_of_none(k, weights.stop - weights.start) < 0.05:
+    if whole and unsure.chance_of_none(k, weights.stop - weights.start - placed.curve_weights) < 0.05:
         return None
     absent = absent_groups(placed.effect, parameters)
     return Doubt(k, "holds_zero", tuple(dict.fromkeys(n for of in absent for n in of))) if absent else None

@@ -77,7 +77,8 @@ class Uncertainty:
     ``moved`` (blocks, parameters): shift of the parameters by each block of the data; ``plain`` and ``coloured``
     (parameters, parameters): their covariance for a white residual, and for one with the spectrum of its
     autoregression; ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form
-    of the model. ``whole`` has, for every effect that has only weights, the variance of a factor of all of them.
+    of the model. ``whole`` has, for every effect that has only weights, the variance of a factor of all of
+    them but those of a curve beside it.
     """
 
     moved: Array
@@ -138,7 +139,11 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
         own, weights = fitted.model.slices(k)
         if own.start == own.stop:
             # all weights as one column: their matrix may be too nearly singular to be inverted
+            weights = slice(weights.start, weights.stop - fitted.model.placed[k].curve_weights)
             v = fitted.theta[weights]
+            if not np.any(v):
+                whole[k] = np.inf
+                continue
             others = np.delete(np.arange(size.size), np.arange(weights.start, weights.stop))
             column = j[:, weights] @ v
             norm = max(float(np.linalg.norm(column)), 1e-150)

@@ -48,14 +48,15 @@ def with_balance(problem: Problem, model: Model, begin: Sequence[Array]) -> list
     return [*begin] if together is None else [together, *begin]
 
 
-def beyond_limits(fitted: Fit, placed: Placed) -> bool:
-    """Return True if a human parameter of a fitted effect is outside its physical range."""
+def beyond_limits(fitted: Fit, placed: Placed) -> tuple[str, ...]:
+    """Return the human parameters of a fitted effect that are outside their physical ranges."""
     limits, forbidden = placed.effect.limits, placed.effect.forbidden
     if not limits and not forbidden:
-        return False
+        return ()
     found = fitted.model.human(fitted.theta)[placed.label]
-    outside = any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
-    return outside or any(a <= h.value <= b for h in found for a, b in forbidden.get(h.name, ()))
+    outside = [h.name for h in found if h.name in limits and not limits[h.name][0] <= h.value <= limits[h.name][1]]
+    outside += [h.name for h in found if any(a <= h.value <= b for a, b in forbidden.get(h.name, ()))]
+    return tuple(outside)
 
 
 def size(placed: Placed) -> int:

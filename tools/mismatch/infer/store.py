@@ -11,6 +11,8 @@ from scipy.stats import norm
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.found import human_values
+from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
@@ -127,7 +129,7 @@ class Store:
         every = weigh(p, fitted)
         mean = {o: float(np.mean(w.density[p.held_rows])) for o, w in every.items()}
         blocks = np.array([[float(np.mean(every[o].density[a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
-        proper = fitted.ok and not any(improper(fitted, e) for e in fitted.model.placed)
+        proper = fitted.ok and not any(improper(p, fitted, e) for e in fitted.model.placed)
         proper = proper and all(self.lawful(w.predictable) for w in every.values())
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
@@ -367,10 +369,18 @@ def figures_of(placed: Placed, fitted: Fit) -> float:
     return size(placed) - (0.0 if shrunk is None else shrunk.precision.size - shrunk.freedom)
 
 
-def improper(fitted: Fit, placed: Placed) -> bool:
-    """Return True if a figure of a fitted effect is outside its physical range, or an essential one is at its bound."""
-    stuck = any(f"{placed.label}.{n}" in fitted.at_bound for n in placed.effect.essential)
-    return stuck or beyond_limits(fitted, placed)
+def improper(problem: Problem, fitted: Fit, placed: Placed) -> bool:
+    """Return True if a figure of a fitted effect is outside its physical range, or an essential one is at its bound.
+
+    A figure that scatters with the noise (``Effect.estimated``) is outside only where its 95 % interval is.
+    """
+    if any(f"{placed.label}.{n}" in fitted.at_bound for n in placed.effect.essential):
+        return True
+    outside = beyond_limits(fitted, placed)
+    if not outside or not set(outside) <= set(placed.effect.estimated):
+        return bool(outside)
+    values, limits = human_values(problem, fitted, uncertainty(problem, fitted))[placed.label], placed.effect.limits
+    return any(values[n].ci95[1] < limits[n][0] or values[n].ci95[0] > limits[n][1] for n in outside)
 
 
 def z_of_p(p: float) -> float:
