@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tools.mismatch.together import load_together
-from tools.research.prove.growth import exponent, main, section, write_runs
+from tools.research.prove.growth import exponent, main, page, write_runs
 
 
 def row(recordings: int, cpu_s: float, place: str = "here", **more: Any) -> dict[str, Any]:
@@ -28,12 +28,11 @@ def test_time_in_proportion_has_an_exponent_of_one() -> None:
     assert exponent([row(25, 10.0), row(50, 40.0)], "cpu_s") == pytest.approx(2.0)
 
 
-def test_the_section_says_where_and_how_it_grows() -> None:
-    text = section([row(50, 40.0), row(25, 10.0), row(25, 12.0, "dask", workers_MB=300)])
+def test_the_page_says_where_and_how_it_grows() -> None:
+    text = page([row(50, 40.0), row(25, 10.0), row(25, 12.0, "dask", workers_MB=300)])
     assert "| this machine, joblib, processes: 2 | 25 | 300000 | 10 | 0.40 | 10 | 500 | backlash, gain" in text
     assert "| Dask, workers: 2 | 25 | 300000 | 12 | 0.48 | 12 | 500, each worker 300 |" in text
     assert "grows with the power 2.00 of the number of recordings" in text
-    assert section([]) == ""
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """Time and memory of ``diagnose --together`` against the number of recordings: on this machine and on Dask.
 
-``python -m tools.research.prove.growth --keep FOLDER`` adds its rows to ``growth.jsonl`` there and goes on where it
-stopped; ``python -m tools.research.prove.together --keep FOLDER --out FILE`` shows them. The recordings are those of
-``docs/many-recordings.md``: a stack with a play of 12 V and a gain that falls with temperature, 60 s at 200 Hz each.
+``python -m tools.research.prove.growth --keep FOLDER --out FILE`` goes on where it stopped. The recordings are like
+those of ``docs/many-recordings.md``: a stack with a play of 12 V and a gain that falls with temperature, 60 s at 200 Hz
+each.
 Every row is one run of the command in a process of its own. The processor time is that of the command, start and
 loading included, and of the workers of the cluster; the cluster's scheduler is not in it.
 """
@@ -27,6 +27,7 @@ import numpy as np
 
 from tools.errors import InputError
 from tools.research.prove.harness import read_rows
+from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
 
 FILE = "growth.jsonl"
@@ -159,10 +160,8 @@ def exponent(rows: Sequence[dict[str, Any]], key: str) -> float:
     return float(np.polyfit(n, np.log([float(r[key]) for r in rows]), 1)[0])
 
 
-def section(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the part of the result's page that holds ``rows``; empty without any."""
-    if not rows:
-        return ""
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the result's page."""
     rows = sorted(rows, key=lambda r: (r["place"] != "here", r["processes"], r["recordings"]))
     revisions = "; ".join(dict.fromkeys(r["revision"] for r in rows))
     kinds = dict.fromkeys((r["place"], r["processes"]) for r in rows)
@@ -181,15 +180,17 @@ def section(rows: Sequence[dict[str, Any]]) -> str:
             cpu, mb = exponent(some, "cpu_s"), exponent(some, "peak_MB")
             slopes.append(
                 f"- {label}: processor time grows with the power {cpu:.2f} of the number of recordings, memory of the "
-                f"command with the power {mb:.2f}; the goal is at most {LINEAR:g}."
+                f"command with the power {mb:.2f}."
             )
-    lengths = " or ".join(f"{s:g}" for s in dict.fromkeys(r["seconds"] for r in rows))
-    return f"""## Time and memory
+    return f"""# Time and memory of many recordings
 
-Made by `python -m tools.research.prove.growth --keep FOLDER` with the same folder, revision {revisions}. Recordings of
-{lengths} s at {RATE_HZ:g} Hz with a play and a gain that falls with temperature, by `micron mismatch diagnose RUNS
---together --per-recording gain`. Processor time is that of the command, start and loading included, and of the workers
-of the cluster. More than a million samples are searched by one process of this machine.
+Made by `python -m tools.research.prove.growth --keep FOLDER --out docs/results/growth.json`, revision {revisions}; do
+not edit.
+
+Recordings of {rows[0]["seconds"]:g} s at {RATE_HZ:g} Hz with a play and a gain that falls with temperature, by `micron
+mismatch diagnose RUNS --together --per-recording gain`. Processor time is that of the command, start and loading
+included, and of the workers of the cluster. More than a million samples are searched by one process of this machine.
+The goal is a power of at most {LINEAR:g} of the number of recordings.
 
 | where | recordings | samples | processor s | per recording | wall s | largest MB | named |
 |---|---|---|---|---|---|---|---|
@@ -200,9 +201,10 @@ of the cluster. More than a million samples are searched by one process of this 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what is not done yet and print the section; exit status 2 on bad input."""
+    """Run what is not done yet and print the page; exit status 2 on bad input."""
     parser = argparse.ArgumentParser(description="Measure time and memory of diagnosing recordings together.")
     parser.add_argument("--keep", type=Path, required=True, help=f"{FILE} there; a stopped run goes on")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the result there (.json or .md)")
     parser.add_argument("--counts", type=int, nargs="+", default=list(COUNTS))
     parser.add_argument("--place", choices=tuple(PLACES), nargs="+", default=list(PLACES))
     parser.add_argument("--processes", type=int, default=2, help="processes of this machine, or workers of Dask")
@@ -222,7 +224,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     out.write(json.dumps(rows[-1]) + "\n")
     except InputError as error:
         parser.error(str(error))
-    print(section(rows))
+    print(page(rows))
+    if options.out is not None:
+        write_result(options.out, page(rows))
     return 0
 
 

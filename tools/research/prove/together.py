@@ -3,7 +3,6 @@
 ``python -m tools.research.prove.together --keep FOLDER --minutes 8`` goes on where it stopped. A family is one drawn
 case whose effect has ``SEVERITY`` noise rms after a re-fit, cut into 5 to 20 recordings: each begins amid the course of
 the plant, with a past that no recording holds. With ``--alone`` the first recording of each is diagnosed alone, too.
-The page also shows time and memory of many recordings where the folder has them (``growth``).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from tools.mismatch.engine.report import Report
 from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Part, Recording, Split
 from tools.mismatch.recording_load import load
-from tools.research.prove import disk, draw, growth
+from tools.research.prove import disk, draw
 from tools.research.prove.catalog import TABLE
 from tools.research.prove.harness import read_rows
 from tools.research.prove.nulls import clopper_pearson
@@ -153,12 +152,8 @@ def not_run(rows: Sequence[dict[str, Any]], families: int, nulls: int) -> str:
     return ", ".join(f"{v} of a {twin.replace('_', ' ')}" for twin, v in left.items() if v > 0) or "none"
 
 
-def page(
-    rows: Sequence[dict[str, Any]], samples: int, families: int, nulls: int, costs: Sequence[dict[str, Any]] = ()
-) -> str:
-    """Return the result's page; ``families`` and ``nulls`` are the numbers that were asked for, ``costs`` the rows of
-    ``growth``.
-    """
+def page(rows: Sequence[dict[str, Any]], samples: int, families: int, nulls: int) -> str:
+    """Return the result's page; ``families`` and ``nulls`` are the numbers that were asked for."""
     drawn, seed = [r for r in rows if r["drawn"]], rows[0]["seed"]
     revisions = "; ".join(dict.fromkeys(r["revision"] for r in rows))
     missed = [
@@ -187,8 +182,7 @@ recalibration.
 ## Not named
 
 {chr(10).join([*missed, *false]) or "- none"}
-
-{growth.section(costs)}"""
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -222,8 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     print(table(rows))
     if options.out is not None:
-        costs = read_rows(options.keep / growth.FILE)
-        write_result(options.out, page(rows, options.samples, options.families, options.nulls, costs))
+        write_result(options.out, page(rows, options.samples, options.families, options.nulls))
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-gate": ("First run", "Sealed corpus, walks", "Sure learned", "Start states"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
-    "together": ("Not named", "Time and memory"),
+    "together": ("Not named",),
     "watch": (),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
