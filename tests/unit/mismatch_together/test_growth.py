@@ -33,6 +33,7 @@ def test_the_page_says_where_and_how_it_grows() -> None:
     assert "| this machine, joblib, processes: 2 | 25 | 300000 | 10 | 0.40 | 10 | 500 | backlash, gain" in text
     assert "| Dask, workers: 2 | 25 | 300000 | 12 | 0.48 | 12 | 500, each worker 300 |" in text
     assert "grows with the power 2.00 of the number of recordings" in text
+    assert "this machine, joblib: 100, 200; Dask: 50, 100, 200." in text
 
 
 @pytest.mark.slow

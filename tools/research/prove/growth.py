@@ -160,8 +160,15 @@ def exponent(rows: Sequence[dict[str, Any]], key: str) -> float:
     return float(np.polyfit(n, np.log([float(r[key]) for r in rows]), 1)[0])
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the result's page."""
+def not_run(rows: Sequence[dict[str, Any]], counts: Sequence[int], places: Sequence[str]) -> str:
+    """Return the numbers of recordings of each place that are not in ``rows``, in words; "none" if all are."""
+    done = {(r["place"], r["recordings"]) for r in rows}
+    left = {p: [str(n) for n in sorted(counts) if (p, n) not in done] for p in places}
+    return "; ".join(f"{PLACES[p]}: {', '.join(n)}" for p, n in left.items() if n) or "none"
+
+
+def page(rows: Sequence[dict[str, Any]], counts: Sequence[int] = COUNTS, places: Sequence[str] = tuple(PLACES)) -> str:
+    """Return the result's page; ``counts`` and ``places`` are those that were asked for."""
     rows = sorted(rows, key=lambda r: (r["place"] != "here", r["processes"], r["recordings"]))
     revisions = "; ".join(dict.fromkeys(r["revision"] for r in rows))
     kinds = dict.fromkeys((r["place"], r["processes"]) for r in rows)
@@ -196,7 +203,7 @@ The goal is a power of at most {LINEAR:g} of the number of recordings.
 |---|---|---|---|---|---|---|---|
 {chr(10).join(lines)}
 
-{chr(10).join(slopes)}
+{chr(10).join([*slopes, f"- Not run, for lack of processor time: {not_run(rows, counts, places)}."])}
 """
 
 
@@ -208,25 +215,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=list(COUNTS))
     parser.add_argument("--place", choices=tuple(PLACES), nargs="+", default=list(PLACES))
     parser.add_argument("--processes", type=int, default=2, help="processes of this machine, or workers of Dask")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no run after these")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each recording")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
     file = options.keep / FILE
     rows = [r for r in read_rows(file) if r["seconds"] == options.seconds]
     done = {(r["recordings"], r["place"], r["processes"]) for r in rows}
+    began = time.monotonic()
     try:
         for place in options.place:
             for count in sorted(options.counts):
-                if (count, place, options.processes) in done:
+                late = time.monotonic() - began >= 60 * options.minutes
+                if late or (count, place, options.processes) in done:
                     continue
                 rows.append(run_one(count, place, options.processes, options.seconds))
                 with file.open("a", encoding="utf-8") as out:
                     out.write(json.dumps(rows[-1]) + "\n")
     except InputError as error:
         parser.error(str(error))
-    print(page(rows))
+    if not rows:
+        return 0
+    text = page(rows, options.counts, options.place)
+    print(text)
     if options.out is not None:
-        write_result(options.out, page(rows))
+        write_result(options.out, text)
     return 0
 
 
