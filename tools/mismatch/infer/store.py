@@ -217,7 +217,9 @@ class Store:
             return known
         model = Model(self.problem.twin, kept)
         theta = model.carry(s.fitted.model, s.fitted.theta, self.problem.recording)
-        return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
+        with np.errstate(all="ignore"):
+            begin = with_balance(self.problem, model, [theta])
+            return self.put(fit(self.problem, model, begin, stride=2, iterations=12))
 
     def with_one(self, s: Scored, place: Placed) -> Scored:
         """Return the set with one more effect, prepared from the residual of the set."""
