@@ -24,7 +24,7 @@ from firmware_py.frame import (
 )
 from firmware_py.records import Record
 from hal.compiled import kernel
-from sim_devices.plant.kernel import STEPS_PER_MS, advance
+from sim_devices.plant.kernel import STEPS_PER_MS, TRUTH_COLUMNS, advance, truth_row
 
 Array = NDArray[np.float64]
 
@@ -81,20 +81,47 @@ def command(s: Record, wires: Record, frame: Array) -> None:
 
 
 @kernel
+def advance_finely(
+    world: tuple[Record, Record, Array],
+    block: tuple[Array, Array, Array, Array],
+    steps: tuple[int, int],
+    row: int,
+    fine: Array,
+) -> int:
+    """Run ``steps`` as ``advance`` does, and write the tip and the rigid tip after each step to ``fine`` (8 n, 6), m.
+
+    The play of the mount is taken up from where the last millisecond left it, so that the run stays the same.
+    """
+    plant, state, truth = world
+    seat = state[0]["seat_m"]
+    part, now, before = np.zeros(6), np.zeros(TRUTH_COLUMNS), np.zeros(3)
+    for j in range(steps[0], steps[1]):
+        row = advance(plant, state, block, (j, j + 1), truth, row)
+        for i in range(3):
+            before[i] = seat[i]
+        truth_row(plant[0], state[0], part, now)
+        for i in range(3):
+            seat[i] = before[i]
+        for i in range(6):
+            fine[j, i] = now[i]
+    return row
+
+
+@kernel
 def closed_loop(
     n: int,
     world: tuple[Record, Record, Array],
     block: tuple[Array, Array, Array, Array],
     row: int,
-    frames: Array,
+    kept: tuple[Array, Array],
     loop: tuple[Record, Record],
 ) -> int:
     """Run ``n`` ticks of 1 ms from the start of a ``block`` (``PlantBlocks``). Return the next free row of the truth.
 
-    ``world``: plant, state and truth; ``loop``: the wires and the firmware's memory. ``frames`` (n, Layout.size) takes
-    the finished frames, or is empty (0, ...) when nobody wants them.
+    ``world``: plant, state and truth; ``loop``: the wires and the firmware's memory. ``kept``: the finished frames
+    (n, Layout.size), and tip and rigid tip in every step of the plant (8 n, 6); an empty array (0, ...) takes nothing.
     """
-    (plant, state, truth), (wire, memory) = world, loop
+    (plant, state, truth), (wire, memory), (frames, fine) = world, loop, kept
     s, wires, frame = state[0], wire[0], memory[0].frame
     for k in range(n):
         first = k * STEPS_PER_MS
@@ -104,11 +131,17 @@ def closed_loop(
             for i in range(len(frame)):
                 frames[k, i] = frame[i]
         arrives = first + wires.delay_steps
-        row = advance(plant, state, block, (first, arrives), truth, row)
+        if len(fine) > 0:
+            row = advance_finely(world, block, (first, arrives), row, fine)
+        else:
+            row = advance(plant, state, block, (first, arrives), truth, row)
         if wires.tick >= wires.armed_tick:
             command(s, wires, frame)
             if int(frame[CLIP]) & ~CLIP_YIELD:
                 wires.clipped += 1
-        row = advance(plant, state, block, (arrives, first + STEPS_PER_MS), truth, row)
+        if len(fine) > 0:
+            row = advance_finely(world, block, (arrives, first + STEPS_PER_MS), row, fine)
+        else:
+            row = advance(plant, state, block, (arrives, first + STEPS_PER_MS), truth, row)
         wires.tick += 1
     return row

@@ -37,7 +37,12 @@ READING_MS = 9
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """``truth`` as of a run over the wire; ``frames`` (n, Layout.size) where they were asked for, one a tick."""
+    """``truth`` as of a run over the wire; ``frames`` (n, Layout.size) where they were asked for, one a tick.
+
+    ``fine`` (8 n, 6), where asked for: tip and rigid tip, m, after every step of the plant from ``started_ns`` on. The
+    truth, once a millisecond at the instant of a scan, shows the actuators' resonance (550 to 750 Hz) at another
+    frequency and always in one phase of the command.
+    """
 
     truth: dict[str, NDArray]
     started_ns: int
@@ -46,6 +51,7 @@ class SimulatedRun:
     clipped: int
     frames: Array | None
     configs: StageConfigs
+    fine: Array | None = None
 
 
 def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
@@ -113,6 +119,7 @@ def simulate(
     delay_s: float = COMMAND_DELAY_S,
     method: str | None = None,
     keep_frames: bool = False,
+    keep_fine: bool = False,
     on_time: Callable[[float], None] | None = None,
     on_block: Callable[[Array, Array], None] | None = None,
 ) -> SimulatedRun:
@@ -145,13 +152,15 @@ def simulate(
     _advance(world, before, ms)  # scans begin with a block
     size = LAYOUT.size
     frames = np.zeros((ms if on_block is not None else ticks if keep_frames else 0, size))
+    fine = np.zeros((STEPS_PER_MS * ticks if keep_fine else 0, 6))
     row, done = ms + 1, 0
     while done < ticks:
         world.next_block()
         n = min(ms, ticks - done)
         part = frames[:n] if on_block is not None else frames[done : done + n]
         arrays = world.plant, world.state, world.truth
-        row = closed_loop(n, arrays, world.block, row, part, (wire, stages.memory))
+        finely = fine[STEPS_PER_MS * done : STEPS_PER_MS * (done + n)]
+        row = closed_loop(n, arrays, world.block, row, (part, finely), (wire, stages.memory))
         done += n
         if on_block is not None:
             on_block(world.truth[ms + 1 : row], part)
@@ -167,6 +176,7 @@ def simulate(
         clipped=int(wire["clipped"][0]),
         frames=frames if keep_frames else None,
         configs=stages.configs,
+        fine=fine if keep_fine else None,
     )
 
 

@@ -86,3 +86,15 @@ def test_block_by_block_is_the_same_run() -> None:
     np.testing.assert_array_equal(np.concatenate(frames).view(np.uint64), whole.frames.view(np.uint64))
     first = np.flatnonzero(whole.truth["t_ns"] == whole.started_ns)[0] + 1
     np.testing.assert_array_equal(np.concatenate(tips), whole.truth["tip_m"][first:])
+
+
+def test_every_step_of_the_plant_is_kept_and_the_run_stays_the_same() -> None:
+    bench = load_bench(BENCH)
+    plain, run = simulate(bench, 0.6), simulate(bench, 0.6, keep_fine=True)
+    assert plain.fine is None
+    assert run.fine is not None
+    for name in ("tip_m", "tip_rigid_m"):
+        np.testing.assert_array_equal(run.truth[name], plain.truth[name])
+    first = np.flatnonzero(run.truth["t_ns"] == run.started_ns)[0] + 1
+    seen = np.hstack([run.truth["tip_m"], run.truth["tip_rigid_m"]])[first:]
+    np.testing.assert_array_equal(run.fine[7::8], seen)

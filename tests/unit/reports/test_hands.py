@@ -8,14 +8,20 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
+from firmware_py.control.plan import load_plan
 from firmware_py.frame import LAYOUT, TREMOR_AHEAD
+from hal.bench import load_bench
+from tests.conftest import DEFAULT_BENCH
+from tools.closed_loop.simulate import SimulatedRun
 from tools.reports.figures import BANDS_HZ, TREMOR_BAND_HZ, BandFigures, Spectrum, TremorFigures
 from tools.research.reports.hand_limits import (
     ABOVE_HZ,
     BandParts,
+    FineMotion,
     Swing,
     band_parts,
     band_rms_um,
+    fine_motion,
     known_tremor_um,
     strongest,
 )
@@ -133,8 +139,38 @@ def test_the_page_says_what_is_added_above_the_band_and_what_room_the_strokes_le
         for name, above in (("still", BandParts(3.0, 2.9, 3.1, 3.4)), ("wide", BandParts(0.9, 1.5, 1.5, 4.1)))
     ]
     page = markdown(rows, 8.0, "x")
-    assert "| still | 3.00 | 3.40 | 1.60 | 0.00 | 2.00 | 0.78 | met |" in page
-    assert "| wide | 0.90 | 4.10 | 4.00 | 1.20 | 1.60 | 1.20 | missed |" in page
+    assert "| still | 3.00 | 3.40 | 1.60 | 0.00 | 2.00 | 0.78 | - | - | met |" in page
+    assert "| wide | 0.90 | 4.10 | 4.00 | 1.20 | 1.60 | 1.20 | - | - | missed |" in page
+
+
+def test_motion_above_the_band_is_judged_in_every_step_of_the_plant_and_synthetic_hands_stricter() -> None:
+    vector = BandFigures(20.0, 4.0, 80.0)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, dict.fromkeys(BANDS_HZ, vector), 1.0, 0.0)
+    swing, above = Swing(9.0, 3.0, 0.9, 74.0, 5.0), BandParts(0.0, 0.0, 0.5, 0.9)
+    page = markdown(
+        [
+            HandRow(name, "-", "adaptive", figures, 1.5, 4.0, 2.0, swing, recorded_s, above, None, FineMotion(0.0, 1.5))
+            for name, recorded_s in (("recorded", 30.0), ("synthetic", float("inf")))
+        ],
+        8.0,
+        "x",
+    )
+    assert "| recorded | 0.00 | 0.90 | 0.90 | 0.00 | 2.00 | 0.50 | 0.00, 1.50 | 1.50 | met |" in page
+    assert "| synthetic | 0.00 | 0.90 | 0.90 | 0.00 | 1.00 | 0.50 | 0.00, 1.50 | 1.50 | missed |" in page
+
+
+def test_fine_motion_sees_a_resonance_that_samples_at_the_scan_do_not() -> None:
+    """A line at 1000 Hz stands still for one sample a millisecond."""
+    ms, steps = 4000, 32_000
+    t_s = (1.0 + np.arange(steps)) / 8000.0
+    fine = np.zeros((steps, 6))
+    fine[:, 0] = 1e-6 * np.sin(2.0 * np.pi * 1000.0 * t_s)
+    fine[:, 1] = fine[:, 4] = 3e-6 * np.sin(2.0 * np.pi * 40.0 * t_s)
+    truth = {"t_ns": 1_000_000 * np.arange(ms + 1), "intended_m": np.zeros((ms + 1, 3))}
+    run = SimulatedRun(truth, 0, 0, 0, 0, None, load_plan(load_bench(DEFAULT_BENCH)).stages, fine)
+    found = fine_motion(run, 1_000_000_000, 3_000_000_000)
+    assert found.hand_um == pytest.approx(3.0 / np.sqrt(2.0), rel=0.01)
+    assert found.added_um == pytest.approx(1.0 / np.sqrt(2.0), rel=0.01)
 
 
 def test_the_page_says_what_strokes_and_estimator_leave_of_the_tremor() -> None:
@@ -155,8 +191,11 @@ def test_people_are_drawn_from_the_revision_and_summed_up_in_every_band() -> Non
     people = []
     for left_um in (1.0, 2.0, 6.0):
         band = BandFigures(20.0, left_um, 100.0 * (1.0 - left_um / 20.0))
-        people.append(TremorFigures((8.0, 12.0), (5.0, 40.0), band, {}, band, dict.fromkeys(BANDS_HZ, band), 1.0, 0.0))
+        bands = dict.fromkeys(BANDS_HZ, band)
+        figures = TremorFigures((8.0, 12.0), (5.0, 40.0), band, {}, band, bands, 1.0, 0.0)
+        people.append((figures, FineMotion(0.3, 0.5 * left_um)))
     lines = people_table(people, seeds)
+    assert "1.45 um in the mean, 2.98 um at worst, met in 2 of 3." in " ".join(lines)
     assert "| 8-12 Hz | 20.00 | 3.00 | 6.00 | 85.0 | 70.0 |" in lines
     assert "| 20-500 Hz | 20.00 | 3.00 | 6.00 | - | - |" in lines
     assert all(str(seed) in " ".join(lines) for seed in seeds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ from tools.terminal import task_name
 
 if TYPE_CHECKING:
     from tools.reports.figures import TremorFigures
+    from tools.research.reports.hand_limits import FineMotion
 
 
 def hands(
@@ -63,7 +65,7 @@ def hands(
         rows: list[HandRow] = []
         stamp = revision_and_day()
         seeds = draw_people(stamp.split(",")[0], people)
-        synthetic: list[TremorFigures] = []
+        synthetic: list[tuple[TremorFigures, FineMotion]] = []
         with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
 
@@ -77,8 +79,8 @@ def hands(
                     result = run_heldout(file, folder, seconds, show)
                 for row in result:
                     rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
-                for figures in run_people(file, seeds, seconds, show):
-                    synthetic.append(figures)  # noqa: PERF402
+                for person in run_people(file, seeds, seconds, show):
+                    synthetic.append(person)  # noqa: PERF402
         need_some(rows)
         page = (
             markdown(rows, seconds, stamp, synthetic, seeds)
@@ -92,6 +94,7 @@ def hands(
         found: dict[str, Any] = {"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}
         if people:
             found["people"] = [
-                {"seed": seed, **figures.to_json()} for seed, figures in zip(seeds, synthetic, strict=False)
+                {"seed": seed, **figures.to_json(), "above_20_Hz_at_8_kHz": asdict(fine)}
+                for seed, (figures, fine) in zip(seeds, synthetic, strict=False)
             ]
         write_json(found, json_file)

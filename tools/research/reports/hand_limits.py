@@ -13,6 +13,8 @@ from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from firmware_py.tremor.adaptive_design import band
 from firmware_py.tremor.config import AdaptiveConfig
+from sim_devices.plant.kernel import STEP_NS
+from tools.closed_loop.simulate import SimulatedRun
 from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ, band_pass
 from tools.research.tremor.cases import RATE_HZ
 from tools.research.tremor.ideal import bound_residual
@@ -21,6 +23,8 @@ Array = NDArray[np.float64]
 
 
 SWING_S = 3.0
+FINE_HZ = 1e9 / STEP_NS
+"""Rate of the plant's steps: the actuators' resonance lies above half of the truth's 1000 Hz."""
 ABOVE_HZ = FOUR_BANDS_HZ[3]
 
 
@@ -110,6 +114,33 @@ class BandParts:
     def added_um(self, whole_um: float) -> float:
         """Return what is added to the hand's own motion where ``whole_um`` is left: root of the powers' difference."""
         return float(np.sqrt(max(whole_um**2 - self.hand_um**2, 0.0)))
+
+
+@dataclass(frozen=True)
+class FineMotion:
+    """Error of the path above 20 Hz in every step of the plant (8 kHz), um rms: of the hand alone, and of the tip."""
+
+    hand_um: float
+    tip_um: float
+
+    @property
+    def added_um(self) -> float:
+        """Return what is added to the hand's own motion: root of the powers' difference."""
+        return float(np.sqrt(max(self.tip_um**2 - self.hand_um**2, 0.0)))
+
+
+def fine_motion(run: SimulatedRun, from_ns: int, to_ns: int) -> FineMotion:
+    """Return the motion above 20 Hz of a run that kept ``fine``, between two instants of it."""
+    assert run.fine is not None
+    t_ns = run.started_ns + STEP_NS * (1.0 + np.arange(len(run.fine)))
+    keep = (t_ns >= from_ns) & (t_ns < to_ns)
+    path = np.stack([np.interp(t_ns, run.truth["t_ns"], x) for x in np.asarray(run.truth["intended_m"]).T], axis=1)
+    found: list[float] = []
+    for moved in (run.fine[:, 3:], run.fine[:, :3]):
+        error = moved - path
+        fast = band_pass(error - error[keep].mean(axis=0), FINE_HZ, (ABOVE_HZ[0], 0.5 * FINE_HZ))[keep]
+        found.append(float(1e6 * np.sqrt(np.mean(np.sum(fast**2, axis=1)))))
+    return FineMotion(*found)
 
 
 def band_parts(

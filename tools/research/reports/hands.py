@@ -25,9 +25,11 @@ from tools.reports.figures import BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, TremorFigu
 from tools.research.reports.hand_limits import (
     ABOVE_HZ,
     BandParts,
+    FineMotion,
     Swing,
     band_parts,
     causal_um,
+    fine_motion,
     known_tremor_um,
     strongest,
 )
@@ -36,7 +38,8 @@ METHODS = ("adaptive", "kalman", "wflc_flc")
 SETTLE_S = 5.0
 GOAL_PERCENT = 70.0
 GOAL_ABOVE_UM = 2.0
-"""Motion that may be added in 20 to 500 Hz on recorded hands."""
+"""Motion that may be added above 20 Hz on recorded hands."""
+GOAL_ABOVE_SYNTHETIC_UM = 1.0
 HANDS = (
     ("physiological tremor of a stretched arm", "tremor_duke_adxl345/data.npz#arm_extended_no_tremor"),
     ("wrist, imitated tremor", "tremor_duke_adxl345/data.npz#on_wrist_simulated_tremor1"),
@@ -69,6 +72,8 @@ class HandRow:
     above: BandParts | None = None
     core: BandParts | None = None
     """Parts of the motion above the tremor band, and of the tremor."""
+    fine: FineMotion | None = None
+    """Motion above the tremor band in every step of the plant."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -83,6 +88,7 @@ class HandRow:
             "swing": asdict(self.swing),
             "above_band": None if self.above is None else asdict(self.above),
             "tremor_band": None if self.core is None else asdict(self.core),
+            "above_20_Hz_at_8_kHz": None if self.fine is None else asdict(self.fine),
             **self.figures.to_json(),
         }
 
@@ -118,7 +124,7 @@ def run_hand(
     ``limits``: those of this hand, where they are known from another estimator's run.
     """
     progress(f"{name}, {method}" if method else name)
-    run = simulate(bench, seconds, hand_file=source, method=method, keep_frames=True)
+    run = simulate(bench, seconds, hand_file=source, method=method, keep_frames=True, keep_fine=True)
     from_ns = run.armed_ns + round(SETTLE_S * 1e9)
     figures = tremor_figures(run.truth, from_ns=from_ns, to_ns=run.safe_ns)
     if figures is None:
@@ -137,7 +143,17 @@ def run_hand(
     swing = strongest(run.truth, from_ns, run.safe_ns)
     used = run.configs.tremor.method
     return HandRow(
-        name, where, used, figures, limited, *limits, swing, recorded_s, parts[ABOVE_HZ], parts[TREMOR_BAND_HZ]
+        name,
+        where,
+        used,
+        figures,
+        limited,
+        *limits,
+        swing,
+        recorded_s,
+        parts[ABOVE_HZ],
+        parts[TREMOR_BAND_HZ],
+        fine_motion(run, from_ns, run.safe_ns),
     )
 
 
@@ -148,17 +164,18 @@ def draw_people(revision: str, count: int) -> list[int]:
 
 def run_people(
     bench: BenchFile, seeds: Sequence[int], seconds: float, progress: Callable[[str], None]
-) -> Iterator[TremorFigures]:
+) -> Iterator[tuple[TremorFigures, FineMotion]]:
     """Run every synthetic person with the bench's own estimator."""
     for seed in seeds:
         progress(f"synthetic person {seed}")
-        run = simulate(bench, seconds, seed=seed)
-        figures = tremor_figures(run.truth, from_ns=run.armed_ns + round(SETTLE_S * 1e9), to_ns=run.safe_ns)
+        run = simulate(bench, seconds, seed=seed, keep_fine=True)
+        from_ns = run.armed_ns + round(SETTLE_S * 1e9)
+        figures = tremor_figures(run.truth, from_ns=from_ns, to_ns=run.safe_ns)
         if figures is not None:
-            yield figures
+            yield figures, fine_motion(run, from_ns, run.safe_ns)
 
 
-def people_table(people: Sequence[TremorFigures], seeds: Sequence[int]) -> list[str]:
+def people_table(people: Sequence[tuple[TremorFigures, FineMotion]], seeds: Sequence[int]) -> list[str]:
     """Return the section of the page that sums up the synthetic people."""
     lines = [
         "## Synthetic people drawn from the revision",
@@ -169,22 +186,28 @@ def people_table(people: Sequence[TremorFigures], seeds: Sequence[int]) -> list[
         "|---|---:|---:|---:|---:|---:|",
     ]
     for low_hz, high_hz in BANDS_HZ:
-        bands = [person.bands[low_hz, high_hz] for person in people]
+        bands = [figures.bands[low_hz, high_hz] for figures, _ in people]
         before, after = ([getattr(b, f"{kind}compensated_rms_um") for b in bands] for kind in ("un", ""))
         less = [b.reduction_percent for b in bands]
         share = ("-", "-") if low_hz == BANDS_HZ[3][0] else (f"{np.mean(less):.1f}", f"{min(less):.1f}")
         cells = (f"{np.mean(before):.2f}", f"{np.mean(after):.2f}", f"{max(after):.2f}", *share)
         name = f"below {high_hz:g} Hz" if low_hz == 0.0 else f"{low_hz:g}-{high_hz:g} Hz"
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    goals = "Goals: 8-12 Hz 85 % less, 2-500 Hz 75 % less (means), 20-500 Hz at most 1 um more than without."
-    return [*lines, "", goals, ""]
+    added = [fine.added_um for _, fine in people]
+    goals = (
+        "Goals: 8-12 Hz 85 % less, 2-500 Hz 75 % less (means). Above 20 Hz, seen in every step of the plant (8 kHz), "
+        f"at most {GOAL_ABOVE_SYNTHETIC_UM:g} um added (root of the powers' difference): {np.mean(added):.2f} um in "
+        f"the mean, {max(added):.2f} um at worst, met in {sum(um <= GOAL_ABOVE_SYNTHETIC_UM for um in added)} of "
+        f"{len(added)}."
+    )
+    return [*lines, "", *wrap(goals, 110), ""]
 
 
 def markdown(
     rows: list[HandRow],
     seconds: float,
     revision: str,
-    people: Sequence[TremorFigures] = (),
+    people: Sequence[tuple[TremorFigures, FineMotion]] = (),
     seeds: Sequence[int] = (),
 ) -> str:
     """The page ``docs/results/hands.json``."""
@@ -269,27 +292,33 @@ def _unseen(rows: Sequence[HandRow]) -> list[str]:
 def above_lines(rows: Sequence[HandRow]) -> list[str]:
     """Return the section of the page on motion above 20 Hz: what adds to the hand's own, and what the strokes leave."""
     text = (
-        f"um rms in 20-500 Hz, as vectors. Added: root of the power's difference to the hand's own. Goal: at most "
-        f"{GOAL_ABOVE_UM:g} um added. By the strokes: what their ends and the way motion yields to them add when the "
-        "tremor is known beforehand; a better estimate of the same motion does not lower it. Room: what the goal then "
-        "leaves to estimator and actuators. By the estimator: what it adds if no stroke ended and the actuators did "
-        "exactly what it says."
+        f"um rms above 20 Hz, as vectors. Added: root of the power's difference to the hand's own. By the strokes: "
+        "what their ends and the way motion yields to them add when the tremor is known beforehand; a better estimate "
+        "of the same motion does not lower it. Room: what the goal then leaves to estimator and actuators. By the "
+        "estimator: what it adds if no stroke ended and the actuators did exactly what it says. All these look once a "
+        "millisecond, at the scan. At 8 kHz: the tip in every step of the plant, which alone shows the actuators' "
+        f"resonance as it is; the goal, at most {GOAL_ABOVE_UM:g} um added ({GOAL_ABOVE_SYNTHETIC_UM:g} um on a "
+        "synthetic hand), is judged there."
     )
     lines = [
         "## Motion above 20 Hz",
         "",
         *wrap(text, 110),
         "",
-        "| hand | its own | with compensation | added | by the strokes | room | by the estimator | goal |",
-        "|---|---:|---:|---:|---:|---:|---:|---|",
+        "| hand | its own | with compensation | added | by the strokes | room | by the estimator "
+        "| at 8 kHz: its own, with | added | goal |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---|",
     ]
     for row in rows:
         if (a := row.above) is not None:
             tip, strokes, estimator = (a.added_um(um) for um in (a.tip_um, a.known_um, a.wish_um))
-            room = max(GOAL_ABOVE_UM**2 - strokes**2, 0.0) ** 0.5
-            figures = (a.hand_um, a.tip_um, tip, strokes, room, estimator)
-            verdict = "met" if tip <= GOAL_ABOVE_UM else "missed"
-            lines.append(f"| {escaped(row.hand)} | {' | '.join(f'{um:.2f}' for um in figures)} | {verdict} |")
+            goal_um = GOAL_ABOVE_UM if isfinite(row.recorded_s) else GOAL_ABOVE_SYNTHETIC_UM
+            room = max(goal_um**2 - strokes**2, 0.0) ** 0.5
+            cells = [f"{um:.2f}" for um in (a.hand_um, a.tip_um, tip, strokes, room, estimator)]
+            fine = row.fine
+            cells += ["-", "-"] if fine is None else [f"{fine.hand_um:.2f}, {fine.tip_um:.2f}", f"{fine.added_um:.2f}"]
+            verdict = "met" if (tip if fine is None else fine.added_um) <= goal_um else "missed"
+            lines.append(f"| {escaped(row.hand)} | {' | '.join(cells)} | {verdict} |")
     return [*lines, ""]
 
 
