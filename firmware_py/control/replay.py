@@ -46,7 +46,10 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     actuation.setdefault("overdrive_tilt", actuation["overdrive"])
     actuation.setdefault("yield_attack_s", 0.0)
     actuation.setdefault("centring", 0.0)
-    tables.setdefault("sensing", {}).setdefault("kinematics_guard", False)
+    sensing = tables.setdefault("sensing", {})
+    sensing.setdefault("kinematics_guard", False)
+    sensing.setdefault("hand_swing_s", 0.0)
+    sensing.setdefault("heading_tilts", False)
     return StageConfigs.from_dict(tables, str(recording.path))
 
 

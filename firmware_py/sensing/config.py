@@ -114,6 +114,9 @@ class SensingConfig(BaseModel):
     # the slow part of the hand's velocity, rms, with its correlation time: error-state filter
     hand_velocity_m_s: Positive = 8e-5
     hand_velocity_s: Positive = 1.0
+    # density of the hand's faster velocity over its variance, which is learned: one over twice a bandwidth of 5 Hz; 0:
+    # that velocity is not looked for
+    hand_swing_s: NotNegative = 0.1
     # middle and width of the band of tremor, which that velocity leaves out; width 0: none
     tremor_notch_hz: tuple[Positive, Annotated[float, Field(ge=0.0)]] = (9.8, 6.0)
     velocity_gate: Annotated[float, Field(ge=0.0)] = 4.0  # standard deviations; 0: no gate
@@ -121,6 +124,7 @@ class SensingConfig(BaseModel):
     alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
     heading_noise_rad: Positive = 0.003  # per square root of a second: the surroundings' own fluctuation
     heading_disturbance_deg: Positive = 0.3  # rms of what turns the field slowly, over some seconds
+    heading_tilts: bool = True  # a tilt about north is known to turn the heading that the field shows
     magnetometer_noise_uT: NotNegative = 0.0  # white, per square root of a second
     horizontal_field_uT: Positive = 20.0
     align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.08

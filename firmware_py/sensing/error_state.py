@@ -10,10 +10,15 @@ Gravity is not measured as a direction: the specific force is integrated to a ve
 does not travel, so v = 0 with a noise density. Accelerations of the hand thereby average out before they turn the
 attitude, where a direct comparison of f with gravity would follow each of them. The velocity of a tremor is far larger
 than that noise but in a known band: a notch takes it out of the comparison, which lets gravity be trusted much more.
+A hand that moves more than that noise says, below the tremor band, is trusted less (accelerometers only): the velocity
+that is seen, its own uncertainty taken off, is the noise of the comparison, too.
 
-The magnetic field turns the heading only; its disturbance has a state of its own with time constant T. A magnet that
-moves with the body is found and taken off the field (gyroscope only, ``magnet.py``). A field whose size or dip is then
-off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
+The magnetic field shows the heading; its disturbance has a state of its own with time constant T. Accelerometers: a
+tilt about north turns what the field shows by the tangent of the dip, and the filter knows it. Without that, an error
+about a leaning axis is corrected with the wrong sign where the dip is steep, and the rate about it runs away once a
+moving hand leaves the tilt to the field. Gyroscopes: the field turns the heading only, because a room's field is off
+by degrees. A magnet that moves with the body is found and taken off the field (gyroscope only, ``magnet.py``). A field
+whose size or dip is then off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
 Accelerometers without a field to believe: the last one stays where it was in the body, which holds the heading on
 average and keeps the rate about the vertical bounded.
 Sequential scalar updates in Joseph form, each gated at ``gate`` standard deviations where that is said.
@@ -46,6 +51,8 @@ from hal.scratch import scratch
 
 FIELD_REGAIN_S = 0.5
 """After a refused field: a body that turns near a magnet passes through attitudes where all looks well."""
+SWAY_S = 0.3
+"""Time constant of the mean about which a hand swings: what is slower is the filter's own error, or a movement."""
 REST_SMOOTHING_S = 0.5
 HELD_AFTER_S = 0.2
 
@@ -68,6 +75,8 @@ def begin_errors(field: Array, state: ErrorStateAttitude, params: ErrorStateNumb
         e.velocity[i] = 0.0
         e.notch[i, 0] = 0.0
         e.notch[i, 1] = 0.0
+        e.sway[i] = 0.0
+        e.swing[i] = 0.0
         e.trusted[i] = state.field[i]
         for j in range(3):
             state.corrected[i, j] = 0.0
@@ -146,13 +155,14 @@ def propagate_errors(
 
 class Measurement(NamedTuple):
     """A scalar measurement of error ``first`` (minus error ``second``, if >= 0), not used beyond ``gate`` standard
-    deviations."""
+    deviations. The turn about north is in it ``lean`` times."""
 
     first: int
     second: int
     residual: float
     variance: float
     gate: float
+    lean: float
 
 
 @kernel
@@ -162,16 +172,16 @@ def correct(measured: Measurement, e: ErrorState, gain: Array) -> bool:
     ``gain`` (ERRORS,) gathers the correction, which the caller applies with ``apply_correction``. False when the
     residual, what ``gain`` already explains taken off, is beyond the gate.
     """
-    first, second, residual, variance, gate = measured
+    first, second, residual, variance, gate, lean = measured
     p = e.covariance
     column = scratch(ERRORS)
     for i in range(ERRORS):
-        column[i] = p[first, i]
+        column[i] = p[first, i] + lean * p[TURN, i]
     if second >= 0:
         for i in range(ERRORS):
             column[i] -= p[second, i]
-    innovation = column[first] + variance
-    rest = residual - gain[first]
+    innovation = column[first] + lean * column[TURN] + variance
+    rest = residual - gain[first] - lean * gain[TURN]
     if second >= 0:
         innovation -= column[second]
         rest += gain[second]
@@ -246,7 +256,13 @@ def error_state_step(motion: Motion, state: ErrorStateAttitude, param: ErrorStat
         seen = params.notch[0] * e.velocity[i] + e.notch[i, 0]
         e.notch[i, 0] = params.notch[1] * e.velocity[i] - params.notch[3] * seen + e.notch[i, 1]
         e.notch[i, 1] = params.notch[2] * e.velocity[i] - params.notch[4] * seen
-        moving = not correct(Measurement(VELOCITY + i, -1, -seen, params.still_density / dt, gate), e, x) or moving
+        density = params.still_density
+        if params.swing_s > 0.0:
+            fast = seen - e.sway[i]
+            e.sway[i] += min(1.0, dt / SWAY_S) * fast
+            e.swing[i] += min(1.0, dt / params.swing_mean_s) * (fast * fast - e.swing[i])
+            density += params.swing_s * max(0.0, e.swing[i] - e.covariance[VELOCITY + i, VELOCITY + i])
+        moving = not correct(Measurement(VELOCITY + i, -1, -seen, density / dt, gate, 0.0), e, x) or moving
     if moving:
         e.gated += 1
         e.moving_s += dt
@@ -256,7 +272,7 @@ def error_state_step(motion: Motion, state: ErrorStateAttitude, param: ErrorStat
         e.moving_s = 0.0
     if resting:
         for i in range(3):
-            correct(Measurement(RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9), e, x)
+            correct(Measurement(RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9, 0.0), e, x)
     e.field_fresh_s += dt
     e.field_wait_s += dt
     if motion.fresh:
@@ -266,7 +282,7 @@ def error_state_step(motion: Motion, state: ErrorStateAttitude, param: ErrorStat
         b = e.trusted
         north = c[0, 0] * b[0] + c[0, 1] * b[1] + c[0, 2] * b[2]
         west = c[1, 0] * b[0] + c[1, 1] * b[1] + c[1, 2] * b[2]
-        correct(Measurement(TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9), e, x)
+        correct(Measurement(TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9, 0.0), e, x)
     apply_correction(state, x)
 
 
@@ -329,7 +345,9 @@ def _heading(state: ErrorStateAttitude, params: ErrorStateParams, x: Array) -> N
         density = params.heading_density
         if params.magnet.room_density > 0.0:
             density += heading_spread(e.magnet, params.magnet, c) * (e.magnet.unit / level) ** 2
-        correct(Measurement(TURN + 2, DISTURBANCE, residual, density / since, 1e9), e, x)
+        # a tilt about north brings the field's vertical part into its west
+        lean = -up / level if params.heading_tilts else 0.0
+        correct(Measurement(TURN + 2, DISTURBANCE, residual, density / since, 1e9, lean), e, x)
         return
     e.rejected += 1
     # a field that has been steady elsewhere for long is the new environment

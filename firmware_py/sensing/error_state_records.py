@@ -20,7 +20,9 @@ class ErrorStateParams:
     rate_density: Array = field("(rad/s)^2/s", 3)  # white noise of alpha
     bias_density: Array = field("(rad/s^2)^2/s", 3)
     force_density: float = field("(m/s)^2/s")  # white noise of the specific force
-    still_density: float = field("(m/s)^2 s")  # how far the velocity of a hand is from zero
+    still_density: float = field("(m/s)^2 s")  # how far the velocity of a hand is from zero, at least
+    swing_s: float = field("s")  # density of the velocity that is seen, over its variance; 0: ``still_density`` alone
+    swing_mean_s: float = field("s")  # time over which that variance is averaged
     velocity_gate: float = field(
         "1"
     )  # standard deviations beyond which a velocity is a movement, not an error; 0: none
@@ -28,6 +30,7 @@ class ErrorStateParams:
     notch: Array = field("1", 5)  # biquad b0 b1 b2 a1 a2 through which the velocity is compared; 1 0 0 0 0: none
     rest_density: float = field("(rad/s)^2 s")  # how far the rate is from zero at rest; 0: rest is not looked for
     heading_density: float = field("rad^2 s")  # of the magnetometer's heading
+    heading_tilts: int = field("1")  # 1: a tilt about north is known to turn the heading that the field shows
     held_density: float = field("rad^2 s")  # of the heading held without a magnetometer; 0: not held
     disturbance_rad: float = field("rad")  # rms of the slow part of its error
     disturbance_s: float = field("s")
@@ -53,6 +56,8 @@ class ErrorState:
     work: Array = field("products of the errors' units", ERRORS, ERRORS)
     velocity: Array = field("m/s", 3)
     notch: Array = field("m/s", 3, 2)  # memory of the biquad
+    sway: Array = field("m/s", 3)  # slow mean of the velocity that is compared with zero
+    swing: Array = field("(m/s)^2", 3)  # mean square of that velocity about its slow mean
     moving_s: float = field("s")
     regained_s: float = field("s")  # since a field was last refused
     trusted: Array = field("uT", 3)  # the last field that was believed, body frame

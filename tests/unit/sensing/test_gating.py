@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from firmware_py.frame import ALIGNING, LAYOUT, MAGNETOMETER_RAW, STATUS
@@ -36,12 +38,39 @@ def test_a_hand_that_moves_away_does_not_turn_the_attitude() -> None:
     frames = frames_of(motion.readings(), motion, seed=3)
     worst, gated = {}, {}
     for gate in (4.0, 0.0):
-        errors, sensing = run(motion, frames.copy(), SensingConfig(velocity_gate=gate))
+        errors, sensing = run(motion, frames.copy(), SensingConfig(velocity_gate=gate, hand_swing_s=0.0))
         worst[gate] = np.max(np.hypot(errors[2000:, 0], errors[2000:, 1]))
         gated[gate] = sensing.state["attitude"]["error_state"]["gated"][0]
     assert worst[4.0] < 10.0 < 15.0 < worst[0.0]
     assert gated[4.0] > 100
     assert gated[0.0] == 0
+    # a hand whose velocity is looked for needs no gate for that
+    errors, _ = run(motion, frames.copy(), SensingConfig(velocity_gate=0.0))
+    assert np.max(np.hypot(errors[2000:, 0], errors[2000:, 1])) < 4.0
+
+
+def swing(seed: int, calm_m_s: float, burst_m_s: float) -> np.ndarray:
+    """(12000, 3) m: a hand that swings at 1.5 to 6 Hz with this velocity (rms), from 4 to 5.5 s with the other one."""
+    n = 12_000
+    band = butter(2, [1.5, 6.0], "bandpass", fs=RATE_HZ, output="sos")
+    path = sosfiltfilt(band, np.random.default_rng(seed).standard_normal((n, 3)), axis=0)
+    t_s = np.arange(n) / RATE_HZ
+    size = gaussian_filter1d(np.where((t_s > 4.0) & (t_s < 5.5), burst_m_s, calm_m_s), 150.0)
+    return size[:, None] * path / np.std(np.gradient(path, 1.0 / RATE_HZ, axis=0))
+
+
+def tilt_rms_deg(motion: Motion, frames: np.ndarray, config: SensingConfig) -> float:
+    errors, _ = run(motion, frames.copy(), config)
+    return float(np.sqrt(np.mean(errors[1500:, 0] ** 2 + errors[1500:, 1] ** 2)))
+
+
+def test_after_a_wild_swing_neither_its_velocity_nor_the_field_turns_the_tilt_away() -> None:
+    """The body's z axis leans and the dip is 66 degrees: an error about it turns what the field shows the other way."""
+    motion = held(12.0, swing(1, 3e-3, 30e-3))
+    frames = frames_of(motion.readings(), motion, seed=1)
+    assert tilt_rms_deg(motion, frames, SensingConfig()) < 1.0
+    assert tilt_rms_deg(motion, frames, SensingConfig(heading_tilts=False)) > 10.0
+    assert tilt_rms_deg(motion, frames, SensingConfig(hand_swing_s=0.0)) > 3.0
 
 
 def test_a_magnet_beside_the_instrument_does_not_turn_the_heading() -> None:
