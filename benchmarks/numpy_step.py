@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.numpy_actuation import AT, Array, NumpyActuation
 from firmware_py.control.stages import Stages
 from firmware_py.records import attributes
+from firmware_py.sensing.error_state import SWAY_S
 from firmware_py.sensing.error_state_records import BIAS, DISTURBANCE, ERRORS, RATE, TURN, VELOCITY
 
 
@@ -125,7 +126,14 @@ class NumpyStep:
         gate = p.velocity_gate if p.velocity_gate > 0.0 else 1e9
         seen = biquads(e.velocity, e.notch[:, None, :], p.notch[None, :])
         unit = np.eye(ERRORS)
-        believed = [self.correct(unit[VELOCITY + i], -seen[i], p.still_density / dt, gate, x) for i in range(3)]
+        fast = seen - e.sway
+        e.sway += min(1.0, dt / SWAY_S) * fast
+        e.swing += min(1.0, dt / p.swing_mean_s) * (fast * fast - e.swing)
+        believed: list[bool] = []
+        for i in range(VELOCITY, VELOCITY + 3):
+            swing = max(0.0, e.swing[i - VELOCITY] - e.covariance[i, i])
+            density = p.still_density + p.swing_s * swing
+            believed.append(self.correct(unit[i], -seen[i - VELOCITY], density / dt, gate, x))
         e.moving_s = 0.0 if all(believed) else e.moving_s + dt
         e.gated += not all(believed)
         if e.moving_s > p.moving_s:
@@ -180,7 +188,7 @@ class NumpyStep:
         e.field_wait_s = e.candidate_s = 0.0
         e.trusted[:] = field
         h = np.zeros(ERRORS)
-        h[TURN + 2], h[DISTURBANCE] = 1.0, -1.0
+        h[TURN], h[TURN + 2], h[DISTURBANCE] = -up / level, 1.0, -1.0
         self.correct(h, e.disturbance - np.arctan2(west, north), p.heading_density / since, 1e9, x)
 
     # -- tremor -------------------------------------------------------------------------------------------

@@ -146,11 +146,13 @@ static void propagate(Errors *e, const ErrorParams *a, double (*c)[3], const dou
     p[DISTURBANCE][DISTURBANCE] += a->disturbance_rad * a->disturbance_rad * (1.0 - fade * fade);
 }
 
-static int correct(Errors *e, int first, int second, double residual, double variance, double gate, double *gain)
+static int correct(Errors *e, int first, int second, double residual, double variance, double gate, double lean,
+                   double *gain)
 {
     double(*p)[N] = e->covariance, column[N];
-    for (int i = 0; i < N; i++) column[i] = p[first][i] - (second >= 0 ? p[second][i] : 0.0); /* P is symmetric */
-    double innovation = column[first] + variance, rest = residual - gain[first];
+    for (int i = 0; i < N; i++) /* P is symmetric */
+        column[i] = p[first][i] + lean * p[TURN][i] - (second >= 0 ? p[second][i] : 0.0);
+    double innovation = column[first] + lean * column[TURN] + variance, rest = residual - gain[first] - lean * gain[TURN];
     if (second >= 0) {
         innovation -= column[second];
         rest += gain[second];
@@ -195,7 +197,8 @@ static int heading(Attitude *s, const ErrorParams *a, const double *b, double *x
     e->field_dip += learn * (dip - e->field_dip);
     e->field_wait_s = e->candidate_s = 0.0;
     for (int i = 0; i < 3; i++) e->trusted[i] = b[i];
-    correct(e, TURN + 2, DISTURBANCE, e->disturbance - atan2(west, north), a->heading_density / since, 1e9, x);
+    correct(e, TURN + 2, DISTURBANCE, e->disturbance - atan2(west, north), a->heading_density / since, 1e9,
+            a->heading_tilts ? -up / level : 0.0, x);
     return 0;
 }
 
@@ -230,7 +233,15 @@ static int attitude(Attitude *s, const sense_params_attitude *p, const double *f
         double seen = a->notch[0] * e->velocity[i] + e->notch[i][0];
         e->notch[i][0] = a->notch[1] * e->velocity[i] - a->notch[3] * seen + e->notch[i][1];
         e->notch[i][1] = a->notch[2] * e->velocity[i] - a->notch[4] * seen;
-        moving |= !correct(e, VELOCITY + i, -1, -seen, a->still_density / dt, gate, x);
+        double density = a->still_density;
+        if (a->swing_s > 0.0) {
+            double fast = seen - e->sway[i], share = dt / a->swing_mean_s;
+            e->sway[i] += (dt / 0.3 < 1.0 ? dt / 0.3 : 1.0) * fast;
+            e->swing[i] += (share < 1.0 ? share : 1.0) * (fast * fast - e->swing[i]);
+            double more = e->swing[i] - e->covariance[VELOCITY + i][VELOCITY + i];
+            density += a->swing_s * (more > 0.0 ? more : 0.0);
+        }
+        moving |= !correct(e, VELOCITY + i, -1, -seen, density / dt, gate, 0.0, x);
     }
     if (moving) {
         e->gated += 1;
@@ -248,7 +259,7 @@ static int attitude(Attitude *s, const sense_params_attitude *p, const double *f
         double *b = e->trusted;
         double north = c[0][0] * b[0] + c[0][1] * b[1] + c[0][2] * b[2];
         double west = c[1][0] * b[0] + c[1][1] * b[1] + c[1][2] * b[2];
-        correct(e, TURN + 2, -1, -atan2(west, north), a->held_density / dt, 1e9, x);
+        correct(e, TURN + 2, -1, -atan2(west, north), a->held_density / dt, 1e9, 0.0, x);
     }
     double tx = c[0][0] * x[0] + c[1][0] * x[1] + c[2][0] * x[2];
     double ty = c[0][1] * x[0] + c[1][1] * x[1] + c[2][1] * x[2];
