@@ -85,7 +85,7 @@ def hands(
         page = (
             markdown(rows, seconds, stamp, synthetic, seeds)
             if folder is None
-            else heldout_page(folder, rows, seconds, stamp)
+            else heldout_page(folder, rows, seconds, stamp, out)
         )
         if out is not None:
             write_result(out, page)

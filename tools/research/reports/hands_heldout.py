@@ -167,8 +167,10 @@ def stroke_percent(row: HandRow) -> float:
     return 100.0 * (1.0 - row.stroke_limit_um / row.figures.vector.uncompensated_rms_um)
 
 
-def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revision: str) -> str:
-    """The page of ``micron hands --heldout``."""
+def heldout_page(
+    folder: Folder, rows: Sequence[HandRow], seconds: float, revision: str, out: Path | None = None
+) -> str:
+    """The page of ``micron hands --heldout``, which goes to ``out``."""
     fits = [row for row in rows if stroke_percent(row) >= FITS_PERCENT]
     reached = [row for row in fits if row.figures.vector.reduction_percent >= GOAL_PERCENT]
     missed = [row for row in fits if row not in reached]
@@ -177,7 +179,7 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
     lines = [
         "# The closed loop in hands that no setting has seen",
         "",
-        f"Made by `micron hands --heldout {folder.path.name}`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"Made by `micron hands --heldout {folder.path.name}{'' if out is None else f' --out {out}'}`, firmware revision {revision}; {seconds:g} s of virtual",
         f"time each, scored from {SETTLE_S:g} s after arming, estimator `{method}` with the bench's settings. Settings",
         "were chosen on the recordings of tools/research/reports/hands_development.toml; none of those is here.",
         "Tremor: rms of the tip as a vector in 8-12 Hz on the physical truth, manipulator resting (without) and",

@@ -27,6 +27,7 @@ Each artefact holds all tables and notes of one result with its command, revisio
 """
 SHOWN: dict[str, tuple[str, ...]] = {
     "hands": (),
+    "heldout": (),
     "reliability": (
         "Answers that were not as expected",
         "What is not seen, or too late",
