@@ -176,10 +176,11 @@ def heldout_page(
     missed = [row for row in fits if row not in reached]
     others = [row for row in rows if row not in fits]
     method = rows[0].method if rows else "-"
+    command = f"micron hands --heldout {folder.path.name}" + ("" if out is None else f" --out {out}")
     lines = [
         "# The closed loop in hands that no setting has seen",
         "",
-        f"Made by `micron hands --heldout {folder.path.name}{'' if out is None else f' --out {out}'}`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"Made by `{command}`, firmware revision {revision}; {seconds:g} s of virtual",
         f"time each, scored from {SETTLE_S:g} s after arming, estimator `{method}` with the bench's settings. Settings",
         "were chosen on the recordings of tools/research/reports/hands_development.toml; none of those is here.",
         "Tremor: rms of the tip as a vector in 8-12 Hz on the physical truth, manipulator resting (without) and",
