@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -16,6 +17,17 @@ class OutputError(InputError):
 
 class RecordingError(InputError):
     """A recording, or its description, cannot be used. The message names file, key, line or sample, and what to do."""
+
+
+def refuse_unknown_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
+    """Raise ``RecordingError`` for the first of ``keys`` that is not ``known``; it names the most similar known key."""
+    allowed = list(known)
+    for key in keys:
+        if key in allowed:
+            continue
+        similar = get_close_matches(key, allowed, 1)
+        advice = f"; write '{similar[0]}', or leave it out" if similar else "; leave it out"
+        raise RecordingError(f"{where} key '{key}' is unknown{advice}. Known keys: {', '.join(allowed)}")
 
 
 def missing_column(path: Path, name: str, have: Sequence[str]) -> RecordingError:

@@ -56,6 +56,7 @@ CHANNEL = (
 SPLIT = (
     Key("fit", "[start, stop] or file name", "samples (stop excluded) or the recording that may be fitted", "the rest"),
     Key("test", "[start, stop] or file name", "samples or the recording that no fit may see", "the rest"),
+    Key("test_NAME", "as test", "further tests of a benchmark; they are checked and not used", "none"),
     Key("initialization", "number of samples", "at the start of a test: may set the state, are not scored", "0"),
 )
 TWIN = (

@@ -19,7 +19,6 @@ class Split:
 
     fit: tuple[int, int] | Path | None = None
     test: tuple[int, int] | Path | None = None
-    others: Mapping[str, tuple[int, int] | Path] = field(default_factory=dict[str, "tuple[int, int] | Path"])
     initialization: int | None = None
 
 

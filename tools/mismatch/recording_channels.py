@@ -9,14 +9,14 @@ from typing import get_args
 
 import numpy as np
 
-from tools.errors import RecordingError
+from tools.errors import RecordingError, refuse_unknown_keys
 from tools.mismatch import units
 from tools.mismatch.recording import Array
 from tools.mismatch.twins.vocabulary import Role, Vocabulary
 from tools.numbers import is_finite_number
 
 MOST_SIZE = 1e100  # of any value: squares must stay finite
-KEYS = {"column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance"}
+KEYS = ("column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance")
 """Keys of one of the ``[[channels]]``."""
 
 
@@ -48,6 +48,7 @@ def read_channels(
         at = f"{where}: [[channels]] {i + 1}"
         if not isinstance(entry, Mapping):
             raise RecordingError(f"{at}: must be a table")
+        refuse_unknown_keys(f"{at}:", entry, KEYS)
         for key in ("column", "role", "signal"):
             if not isinstance(entry.get(key), str) or not entry[key]:
                 raise RecordingError(f"{at}: '{key}' is missing or not a text")
@@ -56,7 +57,6 @@ def read_channels(
             if not entry[key].isprintable() or set(entry[key]) & {'"', "\\"}:
                 raise RecordingError(f"{at}: '{key}' holds quotes, backslashes or unprintable characters; rename it")
         at += f" ('{column}')"
-        notes.extend(f"[[channels]] {i + 1}: key '{k}' is unknown and not used" for k in entry if k not in KEYS)
         if role not in get_args(Role):
             raise RecordingError(f"{at}: role must be input, output or context, got '{role}'")
         if signal in signals:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hal.trust import path_inside
-from tools.errors import RecordingError
+from tools.errors import RecordingError, refuse_unknown_keys
 from tools.mismatch.input_noise import conditional_mean
 from tools.mismatch.recording import Array, Recording, TwinText
 from tools.mismatch.recording_channels import Channel, converted, finite_number, read_channels, refuse_equal_columns
@@ -23,7 +23,11 @@ from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds,
 from tools.numbers import is_finite_number
 
 MIN_SAMPLES = 50
-TOP_KEYS = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions"}
+TOP_KEYS = (
+    "format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions",
+)  # fmt: skip
+TWIN_KEYS = ("kind", "parameters", "effects", "file")
+"""Keys of ``[twin]`` for every kind; those of an ode's parameters may stand there, too."""
 
 
 def load(path: Path | str) -> Recording:
@@ -57,8 +61,8 @@ def from_table(
         twin, words = _twin(where, _twin_table(path, text.get("twin")))
     else:
         words = Vocabulary(open_ended=True)
-    notes = [f"key '{k}' is unknown and not used" for k in text if k not in TOP_KEYS]
-    notes += _unread(text.get("twin"), twin.kind)
+    refuse_unknown_keys(f"{where}:", text, TOP_KEYS)
+    notes: list[str] = []
     data_path = path if columns is not None else path_inside(path, str(data_name))
     in_file = column_units(data_path) if columns is None and data_path.is_file() else {}
     channels = read_channels(where, text["channels"], words, twin.kind, notes, in_file)
@@ -129,18 +133,6 @@ def _for_twin(recording: Recording, time_column: str | None) -> Recording:
         note = pace_note(recording, time_column)
         recording = replace(recording, warnings=(*recording.warnings, note)) if note else recording
     return recording
-
-
-def _unread(twin: object, kind: str) -> list[str]:
-    """Return a note on each key of ``[twin]`` that a twin of this kind does not read there."""
-    if not isinstance(twin, Mapping) or kind == "ode":
-        return []
-    known = ("kind", "parameters", "effects", "file", *(["states"] if kind == "state_space" else []))
-    return [
-        f"[twin] {k} is not read there and not used; parameters stand in [twin.parameters]"
-        for k in twin
-        if k not in known
-    ]
 
 
 def _unused_names(table: Mapping[str, Any], channels: Sequence[Channel]) -> list[str]:
@@ -257,7 +249,9 @@ def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
         raise RecordingError(f"{where}: [twin.parameters] must be a table")
     if kind == "state_space" and "states" in value:
         parameters = {**parameters, "states": value["states"]}
-    if kind == "ode":
+    if kind != "ode":
+        refuse_unknown_keys(f"{where}: [twin]", value, (*TWIN_KEYS, *(["states"] if kind == "state_space" else [])))
+    else:
         parameters = {**parameters, **{k: v for k, v in value.items() if k not in ("kind", "parameters", "effects")}}
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise RecordingError(f"{where}: [[twin.effects]] must be tables")

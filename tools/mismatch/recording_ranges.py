@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from hal.trust import path_inside
-from tools.errors import RecordingError
+from tools.errors import RecordingError, refuse_unknown_keys
 from tools.mismatch.recording import Condition, Split
 from tools.mismatch.recording_clock import CUT
 from tools.numbers import is_finite_number
 
 MIN_SPAN = 30  # least samples of a run, and of a [split] range
+SPLIT_KEYS = ("fit", "test", "initialization")
+FURTHER_TEST = "test_"
+"""Beginning of the names of further test ranges, which benchmarks state; they are checked and not used."""
 APART = ("state_space", "mechanical_axis", "ode", "piezo_stack", "accelerometer", "magnetometer")
 """Kinds of twins whose plants restart at a segment, or have no state."""
 
@@ -79,6 +82,7 @@ def read_split(path: Path, value: object, n: int) -> Split:
         return Split()
     if not isinstance(value, Mapping):
         raise RecordingError(f"{path}: [split] must be a table")
+    refuse_unknown_keys(f"{path}: [split]", (k for k in value if not k.startswith(FURTHER_TEST)), SPLIT_KEYS)
     found: dict[str, tuple[int, int] | Path] = {}
     initialization: int | None = None
     for key, v in value.items():
@@ -96,5 +100,4 @@ def read_split(path: Path, value: object, n: int) -> Split:
         else:
             raise RecordingError(f"{at} must be [start, stop] in samples or the name of another .toml, got {v!r}")
     _enough(path, found, initialization or 0)
-    others = {k: v for k, v in found.items() if k not in ("fit", "test")}
-    return Split(found.get("fit"), found.get("test"), others, initialization)
+    return Split(found.get("fit"), found.get("test"), initialization)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array, Effect, Settings, Stage
-from tools.errors import RecordingError
+from tools.errors import RecordingError, refuse_unknown_keys
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
@@ -18,6 +18,9 @@ from tools.mismatch.twins.cascade import between_of
 from tools.mismatch.twins.core import core
 from tools.mismatch.twins.feedback import FASTEST
 from tools.numbers import is_finite_number
+
+EFFECT_KEYS = ("name", "equation", "site", "target", "stage", "outputs", "settings", "parameters")
+"""Keys of one of the ``[[twin.effects]]``."""
 
 
 def describe(model: Model, theta: Array) -> dict[str, Any]:
@@ -64,6 +67,7 @@ def restore(recording: Recording) -> tuple[Model, Array]:
 
 
 def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Array]:
+    refuse_unknown_keys(f"{where}:", entry, EFFECT_KEYS)
     name, site = entry.get("name"), entry.get("site", "output")
     effect = EFFECTS.get(name) if isinstance(name, str) else None
     if effect is None:
@@ -93,6 +97,7 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
     missing = [n for n in names if not is_finite_number(given.get(n))]
     if missing:
         raise RecordingError(f"{where}: parameters {', '.join(missing[:5])} missing or not finite numbers")
+    refuse_unknown_keys(f"{where}: parameters:", given, names)
     return pl, np.array([float(given[n]) for n in names])
 
 

@@ -17,6 +17,7 @@ from tests.unit.mismatch_model.made import recording
 from tools.cli.main import app
 from tools.errors import RecordingError
 from tools.mismatch import key_tables as keys
+from tools.mismatch import recording_channels, recording_load, recording_ranges
 from tools.mismatch.export.write import FORMATS
 from tools.mismatch.keys import Key
 from tools.mismatch.recording_load import load
@@ -95,16 +96,11 @@ def test_a_stranger_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.Monke
     np.testing.assert_allclose(table["x_mm_simulated"], position, atol=1e-9)
 
 
-def test_only_the_keys_of_the_tables_are_known(tmp_path: Path) -> None:
-    (tmp_path / "data.csv").write_text("u,z\n" + "\n".join(f"{k % 7},{k % 5}" for k in range(60)))
-    (tmp_path / "recording.toml").write_text(
-        'format = 1\ndata = "data.csv"\nrate_hz = 1.0\nplace = "lab"\n[twin]\nkind = "piezo_stack"\n'
-        '[[channels]]\ncolumn = "u"\nrole = "input"\nsignal = "command"\n'
-        '[[channels]]\ncolumn = "z"\nrole = "output"\nsignal = "displacement"\ncolour = "red"\n'
-    )
-    notes = load(tmp_path).warnings
-    assert "key 'place' is unknown and not used" in notes
-    assert "[[channels]] 2: key 'colour' is unknown and not used" in notes
+def test_the_tables_of_the_page_are_those_that_the_loader_knows() -> None:
+    assert set(keys.names(keys.TOP)) == set(recording_load.TOP_KEYS)
+    assert keys.names(keys.CHANNEL) == recording_channels.KEYS
+    assert {k for k in keys.names(keys.SPLIT) if k != "test_NAME"} == set(recording_ranges.SPLIT_KEYS)
+    assert keys.names(keys.TWIN) == recording_load.TWIN_KEYS
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero", "smooth"])

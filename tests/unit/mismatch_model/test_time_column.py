@@ -86,10 +86,3 @@ def test_a_time_column_that_names_its_unit_is_converted(tmp_path: Path) -> None:
     found = load(tmp_path)
     assert found.dt == pytest.approx(0.01)
     assert "time column 't_ms' is in ms: converted to s" in found.warnings
-
-
-def test_a_key_beside_the_parameters_is_not_ignored_without_a_word(tmp_path: Path) -> None:
-    write(tmp_path, np.arange(1000) * 0.01)
-    text = (tmp_path / "recording.toml").read_text()
-    (tmp_path / "recording.toml").write_text(text.replace("[[channels]]", "gain_um_per_V = 2.0\n[[channels]]", 1))
-    assert any(note.startswith("[twin] gain_um_per_V is not read there") for note in load(tmp_path).warnings)

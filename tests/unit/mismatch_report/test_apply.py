@@ -136,7 +136,8 @@ def test_a_force_stays_the_same_when_the_twin_is_written_and_read(tmp_path: Path
     found |= {"outputs": [output], "settings": {FASTEST: [FAST]}, "raw": raw}
     from tools.mismatch.simulate_text import restore
 
-    as_fitted = replace(rec, twin=replace(rec.twin, effects=({**found, "parameters": raw},)))
+    as_written = {**{k: v for k, v in found.items() if k != "raw"}, "parameters": raw}
+    as_fitted = replace(rec, twin=replace(rec.twin, effects=(as_written,)))
     model, start = restore(as_fitted)
     start = start.copy()
     start[: model.n_base] = theta
