@@ -74,6 +74,28 @@ def make_folder_of(path: Path) -> None:
         raise OutputError(_cannot(path, error)) from error
 
 
+@contextmanager
+def folder_atomic(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside ``folder``, whose files are put in ``folder`` at the end of the block.
+
+    ``folder`` is made, or keeps the other files that it has. ``OutputError`` when a file cannot be written; after any
+    exception ``folder`` is what it was before.
+    """
+    make_folder_of(folder)
+    try:
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name[:200]}.") as temporary:
+            part = Path(temporary) / "part"
+            part.mkdir()
+            yield part
+            if folder.is_dir():
+                for file in sorted(part.iterdir()):
+                    os.replace(file, folder / file.name)
+            else:
+                part.rename(folder)
+    except OSError as error:
+        raise OutputError(_cannot(folder, error)) from error
+
+
 def write_json(result: Any, destination: str | None) -> None:
     """Write ``result`` where ``--json`` said."""
     if destination is None:

@@ -17,6 +17,7 @@ from tools.mismatch.recording_clock import LONGEST_GAP, in_seconds, on_grid
 from tools.mismatch.recording_columns import MAX_SAMPLES, column_units, read_columns
 from tools.mismatch.recording_load import MIN_SAMPLES, descriptor
 from tools.mismatch.recording_ranges import MIN_SPAN
+from tools.output import folder_atomic
 from tools.toml_text import toml_text
 
 DESCRIPTOR, DATA = "recording.toml", "data.npz"
@@ -192,7 +193,6 @@ def _write(
     path: Path, text: dict[str, Any], out: Path, columns: dict[str, Array], rate_hz: float, segments: list[int]
 ) -> None:
     """Write the descriptor and its data, without a split in samples, which is no longer valid."""
-    out.mkdir(parents=True, exist_ok=True)
     head = {k: v for k, v in text.items() if k not in ("time_column", "split", "segments")}
     head |= {"data": DATA, "rate_hz": rate_hz}
     if segments:
@@ -202,5 +202,6 @@ def _write(
         file = path_inside(path, twin["file"])
         allow_name(file)  # the new folder names it where it is
         head["twin"] = {"file": os.path.relpath(file, out.resolve())}
-    np.savez(out / DATA, **columns)  # pyright: ignore[reportArgumentType]
-    (out / DESCRIPTOR).write_text(toml_text(head), encoding="utf-8")
+    with folder_atomic(out) as folder:
+        np.savez(folder / DATA, **columns)  # pyright: ignore[reportArgumentType]
+        (folder / DESCRIPTOR).write_text(toml_text(head), encoding="utf-8")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tools.errors import InputError, RecordingError
+from tools.errors import InputError, OutputError, RecordingError
 from tools.mismatch.cut import cut, cut_columns
 from tools.mismatch.recording_load import load
 
@@ -116,3 +118,25 @@ def test_a_rate_that_makes_more_samples_than_a_recording_may_have_is_refused(tmp
     t = np.arange(300) / 100.0
     with pytest.raises(InputError, match=r"2\.69e\+09 samples at 9e\+08 Hz; at most 50000000 are made"):
         cut_columns(tmp_path / "data.csv", t, {"x": np.sin(t)}, rate_hz=9e8)
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_cut_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool) -> None:
+    t = np.arange(300) * 0.01
+    folder, new = write(tmp_path, t, np.sin(t), "rate_hz = 100.0"), tmp_path / "new"
+    if is_there:
+        new.mkdir()
+        (new / "remarks.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+
+    def fail(*_: object) -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as full:
+        full.setattr("tools.mismatch.cut.toml_text", fail)
+        with pytest.raises(OutputError, match=r"new: cannot be written \(No space left on device\); free some space"):
+            cut(folder, new)
+    assert sorted(tmp_path.rglob("*")) == before
+    cut(folder, new)
+    assert sorted(f.name for f in new.iterdir()) == ["data.npz", "recording.toml", *["remarks.txt"] * is_there]
+    assert new.stat().st_mode & 0o055 == 0o055
