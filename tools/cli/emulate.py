@@ -65,8 +65,11 @@ def emulate(
             raise InputError(f"{command[0]}: no such program; name one that is on the PATH, or its path")
         file = load_bench(bench_path(bench))
         buses = [bus.kind for bus in file.description.bus.values()]
-        if len(can or ()) > buses.count("can"):
-            raise InputError(f"--can: {file.path} has {buses.count('can')} CAN buses; name no more interfaces")
+        have = buses.count("can")
+        if len(can or ()) > have:
+            raise InputError(
+                f"--can: {file.path} has {have} CAN {'bus' if have == 1 else 'buses'}; name no more interfaces"
+            )
         if tcp is not None and "serial" not in buses:
             raise InputError(f"--tcp belongs to serial buses, and {file.path} has none; leave it out")
         columns = [read_stimulus(text) for text in stimulus or ()]

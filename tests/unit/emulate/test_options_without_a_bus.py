@@ -5,13 +5,19 @@ from __future__ import annotations
 import pytest
 from typer.testing import CliRunner
 
+from tests.conftest import DEFAULT_BENCH
 from tools.cli.main import app
 
 
 @pytest.mark.parametrize(
-    ("words", "message"), [("--can vcan7", "has 0 CAN buses"), ("--tcp 0", "--tcp belongs to serial buses")]
+    ("bench", "words", "message"),
+    [
+        ("imus", "--can vcan7", "has 0 CAN buses; name no more interfaces"),
+        (str(DEFAULT_BENCH), "--can vcan7 --can vcan8", "has 1 CAN bus; name no more interfaces"),
+        ("imus", "--tcp 0", "--tcp belongs to serial buses"),
+    ],
 )
-def test_an_option_for_a_bus_that_is_not_there_is_refused(words: str, message: str) -> None:
-    done = CliRunner().invoke(app, ["emulate", "imus", *words.split(), "--", "true"])
+def test_an_option_for_a_bus_that_is_not_there_is_refused(bench: str, words: str, message: str) -> None:
+    done = CliRunner().invoke(app, ["emulate", bench, *words.split(), "--", "true"])
     assert done.exit_code == 2, done.output
     assert message in done.stderr
