@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import IO
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hal.bench import BenchFile
 from hal.children import child_command, child_environment
+from tools.terminal import progress_bar
 
 WAVES: tuple[tuple[str, ...], ...] = (("instrument", "tremor"), ("step",))
 """Parts that are compiled beside each other. The step needs the others' stages and is compiled last."""
@@ -35,7 +36,7 @@ def prepare(bench: BenchFile, method: str | None, console: Console) -> None:
     if marker.exists():
         return
     columns = TextColumn("compiling, once on this machine"), BarColumn(24), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as progress:
+    with progress_bar(console, *columns) as progress:
         bar = progress.add_task("compile", total=sum(EXPECTED.values()))
         done = 0
         for wave in WAVES:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import TextColumn
+from rich.progress import Progress, ProgressColumn, TextColumn
 from rich.status import Status
 from rich.table import Column, Table
 from rich.text import Text
@@ -47,6 +47,14 @@ def table_of(title: str | None, *headings: str, left: int = 1, no_wrap: bool = F
         for i, heading in enumerate(headings)
     )
     return Table(*columns, title=title, title_justify="left", **options)
+
+
+def progress_bar(console: Console, *columns: ProgressColumn) -> Progress:
+    """Return a progress display that leaves nothing behind. In a file or pipe it prints nothing.
+
+    Rich's own prints an empty line there at its end.
+    """
+    return Progress(*columns, console=console, transient=True, disable=not console.is_interactive)
 
 
 def task_name() -> TextColumn:

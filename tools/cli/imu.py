@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TimeRemainingColumn
+from rich.progress import BarColumn, TimeRemainingColumn
 
 from tools.cli.bench_option import bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, check_picture, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
-from tools.terminal import table_of, task_name
+from tools.terminal import progress_bar, table_of, task_name
 
 
 def imu(
@@ -120,7 +120,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
         open_bench(described, pace=pace_of(virtual), runtime_dir=Path(folder)) as opened,
-        Progress(*columns, console=console(), transient=True) as bar,
+        progress_bar(console(), *columns) as bar,
     ):
         sensors = open_sensors(opened, only, may_drain=True)
         try:

@@ -18,7 +18,7 @@ from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import Outputs, check_folder, check_names, check_writable, write_json, write_text_atomic
-from tools.terminal import table_of, task_name
+from tools.terminal import progress_bar, table_of, task_name
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -125,7 +125,7 @@ def _diagnose_together(joined: Recording, held_out: float, seed: int, jobs: int,
 
 
 def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, *, here: bool = True) -> Report:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     from tools.mismatch.engine.checks import questions
     from tools.mismatch.infer import diagnose
@@ -134,10 +134,8 @@ def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs:
     loaded = load(recording) if isinstance(recording, Path) else recording
     for note in (*loaded.warnings, *([] if loaded.parts else questions(loaded))):
         print_note(note)
-    with Progress(
-        task_name(), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
-        console=console(), transient=True,
-    ) as progress:  # fmt: skip
+    columns = (task_name(), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn())
+    with progress_bar(console(), *columns) as progress:
         bar = progress.add_task("noise and base parameters", total=None)
 
         def show(what: str, done: int, total: int) -> None:
@@ -172,7 +170,7 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 def _diagnose_folder(
     folder: Path, json_file: str | None, out: Path | None, *, held_out: float, seed: int, jobs: int, dask: str | None,
 ) -> None:  # fmt: skip
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 
     from tools.mismatch import batch
     from tools.mismatch.report.terminal import batch_report
@@ -180,10 +178,7 @@ def _diagnose_folder(
     work = batch.jobs_for(batch.find(folder), out, held_out, seed)
     stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
     rows: list[batch.Row] = []
-    with Progress(
-        task_name(), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console(), transient=True,
-    ) as progress:  # fmt: skip
+    with progress_bar(console(), task_name(), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) as progress:
         bar = progress.add_task("recordings", total=len(work))
         with keep_what_is_there():
             for row in stream:

@@ -14,7 +14,7 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_folder, check_writable, write_json
-from tools.terminal import task_name
+from tools.terminal import progress_bar, task_name
 
 
 def read_report(path: Path) -> dict[str, Any]:
@@ -104,14 +104,14 @@ def plan(
 
 
 def _plan_for(twin: Path, report: dict[str, Any], asked: Any, *, out: Path | None, json_file: str | None) -> None:
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import BarColumn, TextColumn
 
     from tools.mismatch.plan import plan as planning
     from tools.mismatch.plan.show import print_plan
     from tools.mismatch.plan.write import PICTURE, PROGRAM, draw_plan, write_plan
 
     columns = (task_name(), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-    with Progress(*columns, console=console(), transient=True) as bars:
+    with progress_bar(console(), *columns) as bars:
         bar = bars.add_task("inputs", total=asked.evaluations)
         designed = planning.plan_for(
             twin, report, asked, lambda what, done, total: bars.update(bar, completed=done, total=total)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, HandOption, ScaleOption, SeedOption, bench_path
@@ -15,6 +15,7 @@ from tools.cli.common import JsonOption, check_picture, clear_errors, console
 from tools.cli.run import complete_result
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_json
+from tools.terminal import progress_bar
 
 if TYPE_CHECKING:
     from tools.closed_loop.simulate import SimulatedRun
@@ -53,9 +54,7 @@ def simulate_command(
         file = bench_path(bench)
         opened = load_bench(file)
         started_s = time.process_time()
-        with Progress(
-            TextColumn("simulating"), BarColumn(), TimeRemainingColumn(), console=console(), transient=True
-        ) as progress:
+        with progress_bar(console(), TextColumn("simulating"), BarColumn(), TimeRemainingColumn()) as progress:
             bar = progress.add_task("simulate", total=seconds)
             run = simulate(
                 opened, seconds, seed=seed, hand_file=hand, hand_scale=scale, delay_s=delay_s,

@@ -11,9 +11,10 @@ import typer
 from rich.table import Table
 
 from hal.errors import BenchError, DeviceNotFound, HalTimeout
-from tools.cli.common import Exit, clear_errors, print_whole
+from tools.cli.common import Exit, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.terminal import progress_bar, task_name
 
 
 def test_json_is_plain_and_whole(tmp_path: Path):
@@ -95,3 +96,9 @@ def test_keys_in_brackets_reach_the_reader(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(typer.Exit), clear_errors():
         raise BenchError("bench.toml: [device.daq.bus] no such bus")
     assert "[device.daq.bus]" in capsys.readouterr().err
+
+
+def test_a_progress_display_prints_nothing_in_a_pipe(capsys: pytest.CaptureFixture[str]):
+    with progress_bar(console(), task_name()) as progress:
+        progress.add_task("inputs", total=3)
+    assert capsys.readouterr() == ("", "")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, TimeElapsedColumn
+from rich.progress import BarColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.compiled.eligible import check_compiled
@@ -24,7 +24,7 @@ from tools.interrupt import is_stopped
 from tools.output import Outputs, check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
-from tools.terminal import task_name
+from tools.terminal import progress_bar, task_name
 
 if TYPE_CHECKING:
     from tools.research.faults.fault import Fault
@@ -88,7 +88,7 @@ def faults(
             _emulated(file, chosen)
             if compiled:
                 check_compiled(load_bench(file), "realtime")  # emulated time has descriptors here
-        with Progress(task_name(), BarColumn(), TimeElapsedColumn(), console=console(), transient=True) as progress:
+        with progress_bar(console(), task_name(), BarColumn(), TimeElapsedColumn()) as progress:
             task = progress.add_task("starting", total=len(POINTS) * seeds * (len(PHASES) + 1) * len(benches))
             campaigns = (
                 run_campaign(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+from rich.progress import SpinnerColumn, TimeElapsedColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
@@ -17,7 +17,7 @@ from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
-from tools.terminal import task_name
+from tools.terminal import progress_bar, task_name
 
 if TYPE_CHECKING:
     from tools.reports.figures import TremorFigures
@@ -66,7 +66,7 @@ def hands(
         stamp = revision_and_day()
         seeds = draw_people(stamp.split(",")[0], people)
         synthetic: list[tuple[TremorFigures, FineMotion]] = []
-        with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
+        with progress_bar(console(), SpinnerColumn(), task_name(), TimeElapsedColumn()) as progress:
             task = progress.add_task("starting")
 
             def show(text: str) -> None:

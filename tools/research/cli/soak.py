@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
@@ -16,6 +16,7 @@ from tools.interrupt import note_stop
 from tools.output import check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
+from tools.terminal import progress_bar
 
 
 def soak(
@@ -53,9 +54,7 @@ def soak(
             with_block(out, name, "")  # a wrong file is refused before the work
         path = bench_path(bench)
         load_bench(path)
-        with Progress(
-            TextColumn("virtual time"), BarColumn(), TimeRemainingColumn(), console=console(), transient=True
-        ) as progress:
+        with progress_bar(console(), TextColumn("virtual time"), BarColumn(), TimeRemainingColumn()) as progress:
             bar = progress.add_task("soak", total=seconds)
             on_time = lambda done_s: progress.update(bar, completed=done_s)  # noqa: E731
             if wires:

@@ -15,7 +15,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
-from tools.terminal import task_name
+from tools.terminal import progress_bar, task_name
 
 
 def budget(
@@ -66,7 +66,7 @@ def budget(
 
 def _progress() -> Progress:
     columns = (SpinnerColumn(), task_name(), TimeElapsedColumn())
-    return Progress(*columns, console=console(), transient=True)
+    return progress_bar(console(), *columns)
 
 
 def _ideal(bench: Path, seconds: float, json_file: str | None) -> None:

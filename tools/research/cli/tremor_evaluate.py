@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+from rich.progress import SpinnerColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
@@ -15,7 +15,7 @@ from tools.cli.run import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.research.tremor.baselines import BASELINES
-from tools.terminal import task_name
+from tools.terminal import progress_bar, task_name
 
 
 def evaluate(
@@ -86,7 +86,7 @@ def evaluate(
         cases = [c for source in recordings for c in cases_from(source, not as_recorded, not as_recorded)]
         for note in dict.fromkeys(f"{c.name}: {note}" for c in cases for note in c.notes):
             console().print(f"note: {note}", soft_wrap=True)
-        with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
+        with progress_bar(console(), SpinnerColumn(), task_name(), TimeElapsedColumn()) as progress:
             task = progress.add_task("starting")
             results = evaluate_cases(
                 cases, methods, horizons, progress=lambda text: progress.update(task, description=text)
