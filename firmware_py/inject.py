@@ -24,6 +24,10 @@ PROBABILITIES = (
 KEYS = tuple(f.name for f in fields(FaultPlan))
 FOR_EVER = ("for_s", "silent_for_s", "reconnect_after_s")
 """Keys whose times may be inf."""
+STARTS = ("from_s", "silent_after_s", "disconnect_after_s", "bus_off_after_s", "full_after_s")
+"""Keys that say when a fault begins, in s after the bench was opened."""
+FAULTS = (*PROBABILITIES, *STARTS[1:], "babble_hz", "error_frames_hz")
+"""Keys that say what happens; the others say when, how long and how."""
 ONLY_ON = {
     "nack": ("i2c",),
     "write_corruption": ("i2c",),
@@ -66,6 +70,8 @@ def parse_injection(text: str) -> Injection:
         if math.isinf(number) and key not in FOR_EVER:
             raise BenchError(f"--inject {text!r}: {key} must be a finite number")
         values[key] = int(number) if key == "seed" else number
+    if not set(values) & set(FAULTS):
+        raise BenchError(f"--inject {text!r} names no fault; add one of {', '.join(FAULTS)}")
     return Injection(bus, FaultPlan(**values), _address(text, address) if at else None)
 
 
@@ -120,6 +126,20 @@ def check_injections(bench: BenchFile, injections: Sequence[Injection], max_effe
             f"({'motion' if effect == MOTION else 'reads and configures'}), but {given}: take the tip away from "
             f"everything and give --max-effect {effect}, or use an emulated bench"
         )
+
+
+def late_starts(injections: Sequence[Injection], seconds: float) -> list[str]:
+    """Return a sentence for each fault that begins later than a run of ``seconds`` usually ends.
+
+    It is no error: a run's seconds count from the end of the self-test, which takes longer on some benches.
+    """
+    return [
+        f"--inject {injection.bus}: {key} = {start_s:g} s counts from opening the bench, and a run of {seconds:g} s "
+        "after the self-test may end before that; give a smaller one, or more --seconds"
+        for injection in injections
+        for key in STARTS
+        if (start_s := getattr(injection.plan, key)) is not None and start_s > seconds
+    ]
 
 
 def _check_kind(description: BenchDescription, injection: Injection, kind: str) -> None:

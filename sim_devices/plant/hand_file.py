@@ -123,7 +123,7 @@ def _read_npz(path: Path) -> dict[str, Array]:
         with open_npz(path) as data:
             return {k: data[k] for k in data.files}
     except FileNotFoundError:
-        raise HandFileError(f"{path} does not exist") from None
+        raise HandFileError(f"{path} does not exist; name an .npz, a .csv or a recording folder") from None
     except (OSError, ValueError) as error:
         raise HandFileError(f"{path} is not a readable .npz of plain arrays: {error}") from error
 
@@ -133,7 +133,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except FileNotFoundError:
-        raise HandFileError(f"{path} does not exist") from None
+        raise HandFileError(f"{path} does not exist; name an .npz, a .csv or a recording folder") from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise HandFileError(f"{path} is not a readable .csv: {error}") from error
     if len(rows) < 2:
@@ -154,7 +154,7 @@ def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise HandFileError(f"{path} does not exist") from None
+        raise HandFileError(f"{path} does not exist; name an .npz, a .csv or a recording folder") from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise HandFileError(f"{path}: {error}") from error
 

@@ -11,7 +11,15 @@ from rich.text import Text
 from firmware_py.compiled.eligible import check_compiled
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import check_pace, load_bench
-from tools.cli.bench_option import BenchOption, CompiledOption, HandOption, RealtimeOption, SeedOption, bench_path
+from tools.cli.bench_option import (
+    BenchOption,
+    CompiledOption,
+    HandOption,
+    RealtimeOption,
+    SeedOption,
+    bench_path,
+    check_hand,
+)
 from tools.cli.common import clear_errors, console
 from tools.cli.run_watch import RateOption, ReferenceOption, WatchOption, check_twin, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
@@ -74,6 +82,7 @@ def bench(
         if watching is not None:
             check_twin(watching, description)
         if not is_endoscope(description.description):
+            check_hand(hand)
             prepare(description, None, console())
         elif hand is not None:
             raise InputError("--hand belongs to the instrument; an endoscope bench has none")

@@ -45,13 +45,21 @@ ScaleOption = Annotated[
     ),
 ]
 SeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of the emulated world; default from the bench file.")
+    int | None, typer.Option("--seed", min=0, help="Seed of the emulated world; default from the bench file.")
 ]
 
 
 def pace_of(virtual: bool) -> Pace | None:
     """Return the pace that ``--virtual`` asks for; None paces an emulated bench and runs a real one in real time."""
     return "virtual" if virtual else None
+
+
+def check_hand(hand: str | None) -> None:
+    """Read the recorded hand of ``--hand`` before anything is compiled or opened. Raises ``HandFileError``."""
+    if hand is not None:
+        from sim_devices.plant.hand_file import load_hand
+
+        load_hand(hand)
 
 
 def bench_path(chosen: Path | str | None) -> Path:

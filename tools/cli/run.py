@@ -24,7 +24,7 @@ from rich.text import Text
 from firmware_py.compiled.eligible import INJECTED, check_compiled, check_spin
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
-from firmware_py.inject import check_injections, parse_injection
+from firmware_py.inject import check_injections, late_starts, parse_injection
 from firmware_py.machine.processors import format_processors
 from firmware_py.run_request import RunRequest
 from firmware_py.tremor.config import Method, all_methods, why_unknown
@@ -38,8 +38,9 @@ from tools.cli.bench_option import (
     ScaleOption,
     SeedOption,
     bench_path,
+    check_hand,
 )
-from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture
+from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture, print_note
 from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
@@ -166,11 +167,15 @@ def run(
             manual=manual,
             method=None if method is None else estimator_name(method),
         )
-        check_injections(file, [parse_injection(text) for text in request.inject], max_effect)
+        injections = [parse_injection(text) for text in request.inject]
+        check_injections(file, injections, max_effect)
         if is_endoscope(file.description) and (hand is not None or html is not None or sense_only):
             raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
         if is_endoscope(file.description) and method is not None:
             raise InputError("--method belongs to the instrument; an endoscope bench estimates no tremor")
+        check_hand(hand)
+        for late in late_starts(injections, seconds):
+            print_note(late)
         if not is_endoscope(file.description):
             from tools.reports.run_live import opening_lines
 

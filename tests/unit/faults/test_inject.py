@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from firmware_py.app import run_in_process
-from firmware_py.inject import check_injections, effect_of, parse_injection
+from firmware_py.inject import check_injections, effect_of, late_starts, parse_injection
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
@@ -48,6 +49,7 @@ def test_a_plan_is_read_as_it_is_written():
         ("daq0:loss=often", "'often' is not a number"),
         ("daq0:seed=inf", "seed must be a finite number"),
         ("daq0:delay_s=inf", "delay_s must be a finite number"),
+        ("daq0:from_s=2,seed=3", "names no fault; add one of loss, "),
         ("i2c0@DAC:nack=1", "'DAC' is not an I2C address"),
     ],
 )
@@ -73,6 +75,26 @@ def test_for_ever_is_a_time():
 def test_a_fault_that_would_do_nothing_is_refused(texts: tuple[str, ...], says: str):
     with pytest.raises(BenchError, match=says):
         check_injections(load_bench(DEFAULT_BENCH), [parse_injection(text) for text in texts], None)
+
+
+def test_a_fault_that_begins_after_the_run_is_named() -> None:
+    faults = [parse_injection(text) for text in ("daq0:loss=1,from_s=10", "can0:loss=1,from_s=12,bus_off_after_s=10.5")]
+    assert [late.partition(" s counts")[0] for late in late_starts(faults, 10.0)] == [
+        "--inject can0: from_s = 12",
+        "--inject can0: bus_off_after_s = 10.5",
+    ]
+    assert not late_starts(faults, 12.0)
+
+
+def test_a_run_says_before_it_begins_that_a_fault_comes_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ended(*_: object) -> None:
+        raise typer.Exit(7)
+
+    monkeypatch.setattr("tools.cli.run._run_emulated", ended)
+    result = CliRunner().invoke(app, ["run", "--virtual", "--seconds", "2", "--inject", "daq0:loss=1,from_s=3"])
+    assert result.exit_code == 7
+    assert result.stderr.startswith("note: --inject daq0: from_s = 3 s counts from opening the bench")
+    assert "more --seconds\n" in result.stderr
 
 
 @pytest.mark.parametrize(
