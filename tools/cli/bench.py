@@ -90,7 +90,9 @@ def bench(
         try:
             recordings.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"--recordings {recordings}: cannot be made ({error.strerror})") from error
+            raise InputError(
+                f"--recordings {recordings}: cannot be made ({error.strerror}); name a folder that you may write to"
+            ) from error
 
         def announce(address: str) -> None:
             console().print(

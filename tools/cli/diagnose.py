@@ -73,10 +73,12 @@ def scan(
 
     with clear_errors():
         check_writable(json_file)
+        path = bench_path(bench)
+        load_bench(path)
         console().print(f"I2C probe '{probe}': {PROBES[probe]}")
         if probe is ProbeChoice.WRITE:
             _ask("Write to every address of every I2C bus of this bench?", yes)
-        with opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened:
+        with opened_bench(path, pace=pace_of(virtual)) as opened:
             result = scan_bench(opened, probe.value, seconds, lambda text: console().print(text, style="dim"))
         out = data_console()
         out.print("ports of this machine: " + (", ".join(result.ports) or "none"))

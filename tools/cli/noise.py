@@ -63,6 +63,8 @@ def noise(
 
     with clear_errors():
         check_names(image)
+        if scale == 0.0:
+            raise InputError("--scale 0: nothing would be left of the signal; give the unit's size of one count")
         check_writable(json_file, image, reads=[recording, bench])
         image = place_picture(image, PICTURE, reads=[recording, bench])
         log = load_log(recording, rate_hz)

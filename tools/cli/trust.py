@@ -85,6 +85,11 @@ def trust(
         from tools.programs import Program, named_in
 
         for path in paths:
+            if not path.exists():
+                raise InputError(
+                    f"{path}: there is no such file or folder; name a recording, a twin, a bench or a program"
+                )
+        for path in paths:
             programs = [item for item in named_in(path) if not (isinstance(item, Program) and item.is_ours)]
             for item in programs:
                 is_program = isinstance(item, Program)

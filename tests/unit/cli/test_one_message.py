@@ -36,6 +36,24 @@ def test_a_hand_is_read_before_anything_is_compiled(
     assert says in refused(command, "--hand", hand)
 
 
+def test_a_path_that_is_not_there_cannot_be_trusted(tmp_path: Path) -> None:
+    assert "there is no such file or folder" in refused("trust", str(tmp_path), str(tmp_path / "gone"))
+
+
+def test_a_bench_is_read_before_a_scan_says_what_it_will_do(tmp_path: Path) -> None:
+    assert "name an existing bench file" in refused("scan", "--bench", str(tmp_path))
+
+
+def test_a_signal_is_not_scaled_to_nothing(tmp_path: Path) -> None:
+    assert "--scale 0" in refused("noise", str(tmp_path / "rest.csv"), "--scale", "0")
+
+
+def test_a_folder_for_recordings_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    message = refused("bench", "--bench", "endoscope", "--port", "0", "--recordings", str(tmp_path / "file"))
+    assert "cannot be made (File exists); name a folder" in message
+
+
 @pytest.mark.parametrize("command", ["run", "bench", "simulate"])
 def test_a_negative_seed_is_refused(command: str) -> None:
     assert "'--seed'" in refused(command, "--seed", "-1")
