@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from hal.trust import allow_name, path_inside
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_clock import LONGEST_GAP, in_seconds, on_grid
 from tools.mismatch.recording_columns import MAX_SAMPLES, column_units, read_columns
-from tools.mismatch.recording_load import MIN_SAMPLES, descriptor
-from tools.mismatch.recording_ranges import MIN_SPAN
+from tools.mismatch.recording_load import MIN_SAMPLES, descriptor, read_clock
+from tools.mismatch.recording_ranges import MIN_SPAN, read_begins
 from tools.output import folder_atomic
 from tools.toml_text import toml_text
 
@@ -60,25 +60,36 @@ def cut(
     if existing:
         raise InputError(f"{', '.join(existing)}: is there already; name another folder")
     text = descriptor(path)
-    channels = [c for c in text.get("channels", []) if isinstance(c, dict)]
-    names = [str(c["column"]) for c in channels if "column" in c]
-    clock = text.get("time_column")
+    names = _columns(path, text.get("channels"))
+    rate_hz, clock = read_clock(str(path), text)
+    begins = read_begins(path, text.get("segments"))
     data = path_inside(path, str(text.get("data")))
-    columns = read_columns(data, list(dict.fromkeys([*names, *([clock] if isinstance(clock, str) else [])])))
+    columns = read_columns(data, list(dict.fromkeys([*names, *([] if clock is None else [clock])])))
     n = next(iter(columns.values())).size
-    if isinstance(clock, str):
+    if clock is not None:
         t = in_seconds(clock, columns[clock], column_units(data).get(clock, ""))
-    elif isinstance(text.get("rate_hz"), int | float) and text["rate_hz"] > 0:
-        t = np.arange(n) / float(text["rate_hz"])
     else:
-        raise InputError(f"{path}: neither 'rate_hz' nor 'time_column'; give one of them")
-    begins = text.get("segments")
+        assert rate_hz is not None
+        t = np.arange(n) / rate_hz
     written, kept = cut_columns(
-        data, t, {c: columns[c] for c in names}, begins if isinstance(begins, list) else [], (start_s, stop_s),
+        data, t, {c: columns[c] for c in names}, begins, (start_s, stop_s),
         every=every,
     )  # fmt: skip
     _write(path, text, out, written, kept.rate_hz, list(kept.segments))
     return kept
+
+
+def _columns(path: Path, channels: object) -> list[str]:
+    """Return the column of each channel. Raises RecordingError where there is none."""
+    if not isinstance(channels, list) or not channels:
+        raise RecordingError(f"{path}: [[channels]] must be a list of tables")
+    names: list[str] = []
+    for i, channel in enumerate(channels):
+        name = channel.get("column") if isinstance(channel, dict) else None
+        if not isinstance(name, str):
+            raise RecordingError(f"{path}: [[channels]] {i + 1}: 'column' is missing or not a text")
+        names.append(name)
+    return names
 
 
 def cut_columns(

@@ -68,7 +68,7 @@ def from_table(
     channels = read_channels(where, text["channels"], words, twin.kind, notes, in_file)
     if twin.kind == "ode":
         notes += _unused_names(twin.parameters, channels)
-    rate, time_column = _clock(where, text)
+    rate, time_column = read_clock(where, text)
     names = [c.column for c in channels]
     if time_column is not None and time_column not in names:
         names.append(time_column)
@@ -163,7 +163,7 @@ def columns_left_out(path: Path) -> list[str]:
     return [name for name in column_names(path_inside(path, str(text["data"]))) if name not in used]
 
 
-def _clock(where: str, text: Mapping[str, Any]) -> tuple[float | None, str | None]:
+def read_clock(where: str, text: Mapping[str, Any]) -> tuple[float | None, str | None]:
     """Return the rate in Hz and the name of the time column; at least one of them is given."""
     rate, time_column = finite_number(where, "rate_hz", text.get("rate_hz")), text.get("time_column")
     if rate is None and time_column is None:

@@ -38,13 +38,21 @@ def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initializat
         raise RecordingError(f"{path}: [split] fit {list(fit)} and test {list(test)} share samples; move one of them")
 
 
-def read_segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> tuple[int, ...]:
-    """Return the samples at which further runs begin."""
+def read_begins(path: Path, value: object) -> list[int]:
+    """Return the samples of ``segments``, unchecked but for their type. Raises RecordingError."""
     if value is None:
-        return ()
+        return []
     if not isinstance(value, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in value):
         raise RecordingError(f"{path}: segments must be a list of samples at which a new run begins, got {value!r}")
-    lengths = np.diff([0, *value, n])
+    return value
+
+
+def read_segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> tuple[int, ...]:
+    """Return the samples at which further runs begin."""
+    begins = read_begins(path, value)
+    if value is None:
+        return ()
+    lengths = np.diff([0, *begins, n])
     if np.any(lengths < MIN_SPAN):
         raise RecordingError(
             f"{path}: segments {value} leave a run of {int(lengths.min())} of the {n} samples; each needs {MIN_SPAN},"
@@ -54,7 +62,7 @@ def read_segments(path: Path, value: object, n: int, kind: str, resampled: bool)
         raise RecordingError(f"{path}: a twin of kind '{kind}' runs through; make a recording of each of the segments")
     if resampled:
         raise RecordingError(f"{path}: segments count samples, which an irregular time column does not keep; {CUT}")
-    return tuple(value)
+    return tuple(begins)
 
 
 def read_conditions(where: str, value: object) -> dict[str, Condition]:

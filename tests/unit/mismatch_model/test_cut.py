@@ -140,3 +140,22 @@ def test_a_cut_is_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytes
     cut(folder, new)
     assert sorted(f.name for f in new.iterdir()) == ["data.npz", "recording.toml", *["remarks.txt"] * is_there]
     assert new.stat().st_mode & 0o055 == 0o055
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('column = "u"', "column = 3", r"\[\[channels\]\] 1: 'column' is missing or not a text"),
+        ("rate_hz = 100.0", 'rate_hz = "fast"', "rate_hz must be a finite number, got 'fast'"),
+        ("rate_hz = 100.0", "rate_hz = 100.0\nsegments = ['a']", "segments must be a list of samples"),
+        ("rate_hz = 100.0", "", "neither 'rate_hz' nor 'time_column'"),
+    ],
+)
+def test_a_descriptor_that_cannot_be_cut_is_named(tmp_path: Path, old: str, new: str, says: str) -> None:
+    t = np.arange(300) * 0.01
+    folder = write(tmp_path, t, np.sin(t), "rate_hz = 100.0")
+    text = (folder / "recording.toml").read_text()
+    (folder / "recording.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(RecordingError, match=says):
+        cut(folder, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
