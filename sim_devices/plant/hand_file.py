@@ -9,6 +9,7 @@ its folder). ``FILE#NAME`` chooses a recording by name or number, ``FILE#start:s
 from __future__ import annotations
 
 import csv
+import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,14 +166,18 @@ def _contract(path: Path) -> tuple[Path, dict[str, str], float | None, str]:
     data = table.get("data")
     if not isinstance(data, str):
         raise HandFileError(f"{path}: key 'data' (the data file's name) is missing")
+    channels = table.get("channels")
     units = {
         str(c.get("column")): str(c.get("unit"))
-        for c in table.get("channels", [])
-        if c.get("role") != "context" and c.get("unit") in _UNITS
+        for c in (channels if isinstance(channels, list) else [])
+        if isinstance(c, dict) and c.get("role") != "context" and str(c.get("unit")) in _UNITS
     }
     if not units:
         raise HandFileError(f"{path}: no channel is an acceleration, a displacement or an angular rate")
-    return path.parent / data, units, table.get("rate_hz"), table.get("time_column", "t_s")
+    rate_hz, time_column = table.get("rate_hz"), table.get("time_column", "t_s")
+    if not (rate_hz is None or (isinstance(rate_hz, int | float) and 0.0 < rate_hz < math.inf)):
+        raise HandFileError(f"{path}: rate_hz must be a positive number, got {rate_hz!r}")
+    return path.parent / data, units, rate_hz, str(time_column)
 
 
 def _meta(path: Path) -> tuple[float | None, dict[str, str]]:

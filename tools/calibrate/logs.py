@@ -71,6 +71,8 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
     if not names:
         raise InputError(f"{file}: no columns of numbers; a log needs a line of names and lines of numbers below it")
     columns = read_columns(file, names)
+    if next(iter(columns.values())).size == 0:
+        raise InputError(f"{file}: its columns hold no samples; record again, or name another file")
     units = {**column_units(file), **units}
     named = meta.get("time_column")
     time = named if isinstance(named, str) else next((name for name in TIMES if name in columns), None)

@@ -86,13 +86,13 @@ def bench(
             prepare(description, None, console())
         elif hand is not None:
             raise InputError("--hand belongs to the instrument; an endoscope bench has none")
-        sock = bind(listen or LOOPBACK, port)
         try:
             recordings.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(
                 f"--recordings {recordings}: cannot be made ({error.strerror}); name a folder that you may write to"
             ) from error
+        sock = bind(listen or LOOPBACK, port)
 
         def announce(address: str) -> None:
             console().print(

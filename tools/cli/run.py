@@ -41,7 +41,7 @@ from tools.cli.bench_option import (
     check_hand,
 )
 from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture, print_note
-from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
+from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, check_twin, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
@@ -174,6 +174,8 @@ def run(
         if is_endoscope(file.description) and method is not None:
             raise InputError("--method belongs to the instrument; an endoscope bench estimates no tremor")
         check_hand(hand)
+        if watching is not None:
+            check_twin(watching, file)
         for late in late_starts(injections, seconds):
             print_note(late)
         if not is_endoscope(file.description):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -23,14 +24,16 @@ def refused(*words: str) -> str:
     return message
 
 
+def too_late(*_: object) -> None:
+    """Stand in for what must not be reached."""
+    raise AssertionError("compiled before the input was read")
+
+
 @pytest.mark.parametrize("command", ["run", "bench"])
 @pytest.mark.parametrize(("hand", "says"), [("gone.csv", "does not exist; name an .npz"), (".", "recording.toml does")])
 def test_a_hand_is_read_before_anything_is_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, hand: str, says: str
 ) -> None:
-    def too_late(*_: object) -> None:
-        raise AssertionError("compiled before the hand was read")
-
     monkeypatch.setattr(f"tools.cli.{command}.prepare", too_late)
     monkeypatch.chdir(tmp_path)
     assert says in refused(command, "--hand", hand)
@@ -48,10 +51,29 @@ def test_a_signal_is_not_scaled_to_nothing(tmp_path: Path) -> None:
     assert "--scale 0" in refused("noise", str(tmp_path / "rest.csv"), "--scale", "0")
 
 
+def test_a_log_without_samples_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "rest.npz", a=np.zeros(0))
+    assert "its columns hold no samples" in refused("noise", str(tmp_path / "rest.npz"), "--rate-hz", "10")
+
+
 def test_a_folder_for_recordings_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     message = refused("bench", "--bench", "endoscope", "--port", "0", "--recordings", str(tmp_path / "file"))
     assert "cannot be made (File exists); name a folder" in message
+
+
+@pytest.mark.parametrize(
+    ("out", "says"), [(".", "this is a folder"), ("no/x.png", "does not exist"), ("x.y", "ends in")]
+)
+def test_a_picture_is_checked_before_the_workspace_is_computed(tmp_path: Path, out: str, says: str) -> None:
+    assert says in refused("manipulator", "--out", f"{tmp_path}/{out}")
+
+
+def test_a_watched_twin_is_read_before_anything_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tools.cli.run.prepare", too_late)
+    twin = tmp_path / "twin.toml"
+    twin.write_text("format = 1\n")
+    assert "no [twin] table" in refused("run", "--virtual", "--seconds", "400", "--watch", str(twin))
 
 
 @pytest.mark.parametrize("command", ["run", "bench", "simulate"])

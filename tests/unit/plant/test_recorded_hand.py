@@ -159,6 +159,9 @@ def test_a_recording_of_the_contract(tmp_path):
         ("nothing.csv", "cannot be scaled"),
         ("bad.toml", "bad.toml"),
         ("nodata.toml", "key 'data'"),
+        ("texts.toml", "no channel is an acceleration"),
+        ("number.toml", "no channel is an acceleration"),
+        ("fast.toml", "rate_hz must be a positive number, got 'fast'"),
     ],
 )
 def test_every_fault_is_named(tmp_path, source, message):
@@ -167,6 +170,10 @@ def test_every_fault_is_named(tmp_path, source, message):
 
     t = np.arange(500) / 100.0
     (tmp_path / "hand.txt").write_text("x")
+    (tmp_path / "texts.toml").write_text('data = "short.csv"\nchannels = ["a"]\n')
+    (tmp_path / "number.toml").write_text('data = "short.csv"\nchannels = 3\n')
+    channel = '[[channels]]\ncolumn = "x_um"\nunit = "um"\n'
+    (tmp_path / "fast.toml").write_text(f'data = "short.csv"\nrate_hz = "fast"\n{channel}')
     (tmp_path / "broken.npz").write_bytes(b"PK not a zip")
     (tmp_path / "words.csv").write_text(table(["0,1", "0.01,one"]))
     (tmp_path / "short.csv").write_text(table(f"{a},{math.sin(60.0 * a)}" for a in t))

@@ -9,15 +9,18 @@ import typer
 from rich.table import Table
 
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import JsonOption, clear_errors, console, data_console
-from tools.output import check_names, check_writable, write_json
+from tools.cli.common import JsonOption, clear_errors, console, data_console, place_picture
+from tools.output import check_writable, write_json
+
+PICTURE = Path("out/workspace.png")
+"""Default file of the picture."""
 
 
 def manipulator(
     bench: BenchOption = None,
-    out: Annotated[Path, typer.Option("--out", metavar="PNG", help="Picture of the workspace.")] = Path(
-        "out/workspace.png"
-    ),
+    out: Annotated[
+        Path | None, typer.Option(metavar="PNG", help=f"Picture of the workspace; default {PICTURE}.")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Compute extents, largest sphere, singularity and conditioning of the bench's manipulator.
@@ -34,8 +37,8 @@ def manipulator(
     from tools.research.manipulator.workspace import analyse
 
     with clear_errors():
-        check_names(out)
-        check_writable(json_file)
+        check_writable(json_file, out)
+        picture = place_picture(out, PICTURE)
         config = load_plan(load_bench(bench_path(bench))).stages.actuation
         analysis = analyse(config)
         table = Table(title="Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", title_justify="left")
@@ -55,6 +58,8 @@ def manipulator(
         table.add_row("forward(inverse(tip)) - tip (nm)", "< 1", f"{1e9 * analysis.identity_m:.1e}")
         table.add_row("Newton steps from level, most", "<= 3", str(analysis.newton))
         data_console().print(table)
-        save_workspace_picture(config, analysis, out)
-        console().print(f"picture: {out}")
-        write_json({"format": 1, "picture": str(out), **asdict(analysis)}, json_file)
+        if picture is not None:
+            save_workspace_picture(config, analysis, picture)
+            console().print(f"picture: {picture}")
+        written = None if picture is None else str(picture)
+        write_json({"format": 1, "picture": written, **asdict(analysis)}, json_file)
