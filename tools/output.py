@@ -20,6 +20,9 @@ from hal.trust import allow_name
 from tools.errors import InputError, OutputError
 from tools.interrupt import is_stopped
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a disk, or of one's share of it, that is full."""
+
 
 def write_text_atomic(path: Path, text: str) -> None:
     """Write the whole file or nothing. Raises ``OutputError`` when it cannot be written."""
@@ -255,5 +258,5 @@ def check_folder(
 
 
 def _cannot(path: object, error: OSError) -> str:
-    advice = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "name a folder that you may write to"
+    advice = "free some space" if error.errno in FULL else "name a folder that you may write to"
     return f"{path}: cannot be written ({error.strerror or error}); {advice}"

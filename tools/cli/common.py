@@ -24,7 +24,7 @@ from hal.errors import HalError
 from hal.trust import NotTrusted
 from tools.errors import InputError, OutputError
 from tools.interrupt import begin_command, is_stopped, note_stop
-from tools.output import check_writable
+from tools.output import FULL, check_writable
 from tools.terminal import plain_console
 
 JsonOption = Annotated[
@@ -34,6 +34,8 @@ JsonOption = Annotated[
 
 PICTURES = (".png", ".svg", ".pdf", ".jpg")
 """Formats of a picture that is drawn with matplotlib, by the ending of its file."""
+CIRCLE = "Symlink loop"
+"""Beginning of what pathlib says, until Python 3.13, of links that run in a circle."""
 DECIDING = (
     ("mismatch", "diagnose"),
     ("mismatch", "apply"),
@@ -131,9 +133,18 @@ def clear_errors() -> Iterator[None]:
         except HalError as error:
             _fail(error, exit_code_of(error))
         except OSError as error:
+            if error.errno in FULL:
+                where = error.filename or "standard output"
+                print_error(f"{where}: cannot be written ({error.strerror}); free some space")
+                raise typer.Exit(Exit.FAILED) from error
             if error.filename is None:
                 raise  # no file of a person; a reader of the pipe that went away, for one
             print_error(f"{error.filename}: cannot be used ({error.strerror}); name another file, or change its rights")
+            raise typer.Exit(Exit.BAD_INPUT) from error
+        except RuntimeError as error:
+            if not str(error).startswith(CIRCLE):
+                raise
+            print_error(f"{error}: its links lead back to it; name a file that is there")
             raise typer.Exit(Exit.BAD_INPUT) from error
         except MemoryError as error:
             print_error(

@@ -1,5 +1,6 @@
 """JSON output and errors of all commands."""
 
+import errno
 import json
 import subprocess
 import sys
@@ -102,3 +103,11 @@ def test_a_progress_display_prints_nothing_in_a_pipe(capsys: pytest.CaptureFixtu
     with progress_bar(console(), task_name()) as progress:
         progress.add_task("inputs", total=3)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_full_disk_behind_standard_output_is_one_message(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(typer.Exit) as caught, clear_errors():
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.exit_code == Exit.FAILED
+    said = capsys.readouterr().err
+    assert said == "micron: standard output: cannot be written (No space left on device); free some space\n"

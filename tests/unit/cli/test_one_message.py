@@ -43,6 +43,13 @@ def test_a_path_that_is_not_there_cannot_be_trusted(tmp_path: Path) -> None:
     assert "there is no such file or folder" in refused("trust", str(tmp_path), str(tmp_path / "gone"))
 
 
+@pytest.mark.parametrize("words", [("mismatch", "diagnose"), ("noise",), ("mismatch", "new"), ("run", "--bench")])
+def test_links_that_run_in_a_circle_are_named(tmp_path: Path, words: tuple[str, ...]) -> None:
+    circle = tmp_path / "circle.csv"
+    circle.symlink_to(circle)
+    assert "circle.csv" in refused(*words, str(circle))
+
+
 def test_a_bench_is_read_before_a_scan_says_what_it_will_do(tmp_path: Path) -> None:
     assert "name an existing bench file" in refused("scan", "--bench", str(tmp_path))
 
