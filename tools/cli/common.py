@@ -90,6 +90,12 @@ def check_picture(path: Path | None, formats: Sequence[str] = PICTURES) -> None:
         raise InputError(f"{path}: a picture ends in {' or '.join(formats)}; name such a file")
 
 
+def check_recording_name(path: Path | None) -> None:
+    """Refuse a name for a new recording that promises another format: ``InputError``."""
+    if path is not None and path.suffix.lower() != ".mcap":
+        raise InputError(f"{path}: a recording ends in .mcap; name such a file ('micron export' makes csv and others)")
+
+
 def place_picture(
     chosen: Path | None, default: Path, *, formats: Sequence[str] = PICTURES, reads: Sequence[str | Path | None] = ()
 ) -> Path | None:

@@ -12,7 +12,7 @@ import typer
 from firmware_py.recording.cut import cut
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
-from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.cli.common import Exit, JsonOption, check_recording_name, clear_errors, console
 from tools.errors import InputError
 from tools.formats.export import FORMATS, ExportReport
 from tools.formats.export import export as export_recording
@@ -33,6 +33,7 @@ def recover(
     """
     with clear_errors():
         check_writable(json_file, out, reads=[file], overwrite=overwrite)
+        check_recording_name(out)
         report = recover_recording(file, out or file.with_suffix(".recovered.mcap"), overwrite=overwrite)
         for line in report.lines():
             console().print(line, soft_wrap=True)

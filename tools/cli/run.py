@@ -40,7 +40,7 @@ from tools.cli.bench_option import (
     bench_path,
     check_hand,
 )
-from tools.cli.common import Exit, JsonOption, clear_errors, console, place_picture, print_note
+from tools.cli.common import Exit, JsonOption, check_recording_name, clear_errors, console, place_picture, print_note
 from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, check_twin, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
@@ -126,7 +126,8 @@ def run(
     Example: micron run --virtual --seconds 20 --json -
     """
     with clear_errors():
-        check_names(image)
+        check_names(image, record)
+        check_recording_name(record)
         reads = [bench, hand, manual, watch]
         check_writable(json_file, html, record, image, reads=reads)
         image = place_picture(image, PICTURE, formats=(".png",), reads=reads)

@@ -50,6 +50,12 @@ def test_links_that_run_in_a_circle_are_named(tmp_path: Path, words: tuple[str, 
     assert "circle.csv" in refused(*words, str(circle))
 
 
+@pytest.mark.parametrize("words", [("run", "--virtual"), ("endoscope", "play"), ("recover", "old.mcap")])
+def test_a_recording_is_not_named_as_another_format(tmp_path: Path, words: tuple[str, ...]) -> None:
+    option = "--out" if words[0] == "recover" else "--record"
+    assert "x.csv: a recording ends in .mcap" in refused(*words, option, str(tmp_path / "x.csv"))
+
+
 def test_a_bench_is_read_before_a_scan_says_what_it_will_do(tmp_path: Path) -> None:
     assert "name an existing bench file" in refused("scan", "--bench", str(tmp_path))
 

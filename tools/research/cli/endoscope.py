@@ -10,7 +10,7 @@ from rich.progress import track
 from rich.table import Table
 
 from tools.cli.bench_option import bench_path
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.cli.common import Exit, JsonOption, check_recording_name, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
@@ -76,6 +76,7 @@ def play_command(
 
     with clear_errors():
         check_writable(json_file, record, report)
+        check_recording_name(record)
         if direct and (record or bench):
             raise InputError("--direct runs without a bench; leave out --bench and --record")
         control = ControlConfig(mapping=mapping_of(mapping), gain=gain, response_s=response)
