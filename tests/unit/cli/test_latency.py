@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import stat
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from firmware_py.scheduler.histogram import DurationHistogram
+from hal.errors import HalError
 from tests.conftest import DEFAULT_BENCH
 from tools.diagnose.c_reference import COMPILERS, CReference, compile_reference
 from tools.diagnose.latency import Lateness, Loop, firmware_loop, loops_of, take_turns
@@ -131,3 +133,10 @@ def test_the_firmware_of_either_instrument_counts_its_ticks(bench: str, compiled
     histogram = DurationHistogram()
     firmware_loop(DEFAULT_BENCH.with_name(f"{bench}.toml"), "other", 0.5, histogram, compiled=compiled)
     assert histogram.n > 0
+
+
+def test_what_the_firmware_said_is_not_said_to_be_said_by_micron_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = subprocess.CompletedProcess([], 1, stdout="", stderr="micron: the budgets do not fit\n")
+    monkeypatch.setattr("tools.diagnose.latency.subprocess.run", lambda *_, **__: done)
+    with pytest.raises(HalError, match=r"^the budgets do not fit$"):
+        firmware_loop(DEFAULT_BENCH, "other", 0.1, DurationHistogram())

@@ -287,6 +287,7 @@ def test_before_any_recording_a_description_without_data_is_enough(tmp_path: Pat
         (Wish(), "add --amplitude"),
         (Wish(amplitude=-1.0), "--amplitude -1"),
         (Wish(amplitude=1e9), "--amplitude 1e.09: must be a positive number below 1e9"),
+        (Wish(amplitude=1e-10, centre=2.0), "--amplitude 1e-10: is lost beside the centre 2; give 2e-09 or more"),
         (Wish(amplitude=1.0, centre=float("nan")), "--centre nan: must be a number"),
         (Wish(amplitude=10.0, duration_s=0.01), "--duration 0.01"),
         (Wish(amplitude=10.0, band_hz=(1.0, 900.0)), "half the sampling rate"),
@@ -296,6 +297,10 @@ def test_before_any_recording_a_description_without_data_is_enough(tmp_path: Pat
 def test_impossible_wishes_are_refused_by_one_message(wish: Wish, message: str):
     with pytest.raises(InputError, match=message):
         settle_limits(wish, "V", 1 / RATE_HZ, None, "twin.toml", None)
+
+
+def test_an_input_that_was_recorded_at_rest_is_no_wish():
+    assert settle_limits(Wish(), "V", 1 / RATE_HZ, np.full(900, 3.0), "x", None).amplitude == 0.0
 
 
 def test_limits_outside_the_bench_are_refused():

@@ -190,3 +190,12 @@ def test_the_refit_of_a_twin_that_the_engine_wrote_as_two_filters_is_scored(
     figures, _ = sealed(s, fit, report, tmp_path)
     assert figures[1] == pytest.approx(figures[2], rel=1e-6)
     assert figures[1] < 1.5 * figures[0]
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"format": 1}', '{"emps": {"left": 3}}', '{"emps": {"left": []}}'])
+def test_a_file_of_another_kind_holds_no_finished_sets(tmp_path: Path, text: str) -> None:
+    rows = tmp_path / "rows.json"
+    rows.write_text(text)
+    with pytest.raises(InputError, match=r"rows\.json: no .*name a new file, or one of an earlier run"):
+        measured.table(["emps"], rows)
+    assert rows.read_text() == text

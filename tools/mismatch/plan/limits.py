@@ -18,6 +18,8 @@ MOST_SAMPLES = 60_000
 """Largest number of samples of a plan. Every candidate input is simulated with every model, some hundred times."""
 BAND_SHARE = 0.1
 """Highest frequency of a default band, as a share of the sampling rate."""
+LEAST_SHARE = 1e-9
+"""Least amplitude of an input as a share of its centre; with less, rounding changes the wave."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,9 @@ def settle_limits(
         check_bench(centre, amplitude, rate, unit, bench)
     if amplitude is None:
         raise InputError(f"{where}: nothing was recorded, so nothing says how far the input may go; add --amplitude")
+    least = 0.0 if centre is None else LEAST_SHARE * abs(centre)
+    if wish.amplitude is not None and wish.amplitude < least:
+        raise InputError(f"--amplitude {amplitude:g}: is lost beside the centre {centre:g}; give {least:g} or more")
     duration = 10.0 if duration is None else duration
     if not LEAST_SAMPLES <= duration / dt <= MOST_SAMPLES:
         raise InputError(

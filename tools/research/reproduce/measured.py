@@ -23,6 +23,7 @@ from firmware_py.recording.revision import git_revision
 from tools.errors import InputError
 from tools.mismatch.infer import diagnose
 from tools.numbers import rms
+from tools.output import make_folder_of, write_text_atomic
 from tools.research.prove.disk import toml_text
 from tools.research.prove.runner import as_plain
 from tools.research.reproduce.measured_page import document
@@ -54,7 +55,7 @@ def chosen(only: Sequence[str]) -> list[MeasuredSet]:
     return [s for s in SETS if not only or any(o in s.name for o in only)]
 
 
-def _finished(path: Path) -> dict[str, Any]:
+def _finished(path: Path) -> dict[str, Scored]:
     """Return the finished sets in the file. Raises InputError for a folder, and for a file of another kind."""
     try:
         found = json.loads(path.read_text())
@@ -62,9 +63,10 @@ def _finished(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: no JSON of finished sets ({error}); name a new file, or one of an earlier run"
         ) from error
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: no finished sets in it; name a new file, or one of an earlier run")
-    return found
+    try:
+        return {name: _scored(name, kept) for name, kept in found.items()}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: no finished sets in it; name a new file, or one of an earlier run") from error
 
 
 def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path | None = None) -> Table:
@@ -73,9 +75,8 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path 
     """
     begin = time.perf_counter()
     wanted = chosen(only)
+    found = _finished(rows_file) if rows_file is not None and rows_file.exists() else {}
     check()
-    kept = _finished(rows_file) if rows_file is not None and rows_file.exists() else {}
-    found: dict[str, Scored] = {name: _scored(name, k) for name, k in kept.items()}
     diagnosed: dict[str, tuple[dict[str, Any], float]] = {}
     for s in wanted:
         if s.name in found:
@@ -85,9 +86,8 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path 
         done = found[s.name]
         print(f"{s.name}: {done.verdict} {', '.join(done.named)} ({done.cpu_s:.0f} s of CPU)", file=sys.stderr)
         if rows_file is not None:
-            kept[s.name] = asdict(done)
-            rows_file.parent.mkdir(parents=True, exist_ok=True)
-            rows_file.write_text(json.dumps(kept, default=float))
+            make_folder_of(rows_file)
+            write_text_atomic(rows_file, json.dumps({n: asdict(k) for n, k in found.items()}, default=float))
     selected = [found[s.name] for s in SETS if s.name in found and (not only or s in wanted)]
     rows = tuple(row for done in selected for row in rows_of(done))
     return Table(
