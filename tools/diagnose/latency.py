@@ -230,8 +230,8 @@ def firmware_loop(
             )
             outcome_file = Path(folder) / "outcome.json"
             if done.returncode != 0 or not outcome_file.exists():
-                said = (done.stderr.strip().splitlines() or ["the firmware did not run"])[-1]
-                raise HalError(said.removeprefix("micron: "))
+                message = (done.stderr.strip().splitlines() or ["the firmware did not run"])[-1]
+                raise HalError(message.removeprefix("micron: "))
             outcome = json.loads(outcome_file.read_text(encoding="utf-8"))
         opening = next(line for line in map(json.loads, done.stdout.splitlines()) if "histograms" in line)
         histogram.add_histogram(memory.histogram(opening["histograms"].index("lateness")))
