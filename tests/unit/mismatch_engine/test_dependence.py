@@ -5,7 +5,13 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from tools.mismatch.engine.dependence import cross_fitted_share, dependences, needs_memory, projected_energy
+from tools.mismatch.engine.dependence import (
+    cross_fitted_share,
+    dependences,
+    follows_course,
+    needs_memory,
+    projected_energy,
+)
 from tools.mismatch.engine.features import Feature, curve, features_of, last_reversal
 
 N = 3000
@@ -59,6 +65,21 @@ def test_nonlinear_relation_is_found_and_the_decoy_is_not(seed: int) -> None:
     assert best.signal == "x"
     assert best.p_value < 1e-4
     assert all(d.p_value > 1e-4 or d.strength < best.strength / 2 for d in found if d.signal == "decoy")
+
+
+def test_a_walk_follows_no_other_walk_and_a_curve_of_it_is_found_with_its_size() -> None:
+    shares: list[float] = []
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 7])
+        x, own = (np.cumsum(rng.standard_normal(N)) for _ in range(2))
+        heard = own / own.std() + 0.3 * rng.standard_normal(N)
+        alone = follows_course(heard, features_of({"x": x}, DT))
+        assert all(d.p_value > 1e-3 or d.strength < 0.1 for d in alone if d.signal != "time")
+        z = (x - x.mean()) / x.std()
+        best = follows_course(heard + 2.0 * np.abs(z), features_of({"x": x}, DT))[0]
+        assert (best.signal, best.p_value < 1e-6) == ("x", True)
+        shares.append(best.strength * float(np.var(heard + 2.0 * np.abs(z))) / float(np.var(2.0 * np.abs(z))))
+    assert float(np.median(shares)) == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize("seed", range(3))

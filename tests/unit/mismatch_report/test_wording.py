@@ -129,6 +129,8 @@ def test_why_an_effect_is_not_named_is_said_with_the_figures_that_show_it():
     assert wording.why_withheld(doubtful, fit).startswith(
         "beside what is left unexplained it is too likely to be wrong"
     )
+    led = replace(held, name="random_walk", reason="follows_signal", shown_by=("lamp",))
+    assert wording.why_withheld(led, fit).startswith("it depends on no signal, but what it explains follows lamp;")
 
 
 def test_a_rest_that_follows_nothing_is_not_said_to_be_above_a_known_floor() -> None:

@@ -8,7 +8,7 @@ residual itself, which attributes part of a true dependence to colour: the test 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,10 +124,7 @@ def dependences(
         edges = np.linspace(0, e.size, 25).astype(int)
         blocks = [(int(a), int(b)) for a, b in itertools.pairwise(edges)]
     model = whitener or fit_whitener(e, stretches=stretches)
-    white = whiten(model, e, stretches)
-    limit = 8.0 * float(np.median(np.abs(white))) * 1.4826
-    if limit > 0:
-        white = np.clip(white, -limit, limit)
+    white = _without_outliers(whiten(model, e, stretches))
     found: list[Dependence] = []
     for feature in features:
         if own_colour:
@@ -136,16 +133,45 @@ def dependences(
             p = whitened_f(white, whiten(model, feature.columns, stretches))
         share = cross_fitted_share(e, feature.columns, blocks)
         found.append(Dependence(feature.signal, feature.kind, p, share, feature.memory))
+    return sorted(_corrected(found), key=lambda d: (-d.strength, d.p_value))
+
+
+def _without_outliers(white: Array) -> Array:
+    limit = 8.0 * float(np.median(np.abs(white))) * 1.4826
+    return np.clip(white, -limit, limit) if limit > 0 else white
+
+
+def _corrected(found: list[Dependence]) -> list[Dependence]:
+    """Return the dependences with p-values that are corrected for their number (Holm 1979)."""
     order = np.argsort([d.p_value for d in found])
     corrected = np.ones(len(found))
     running = 0.0
     for rank, i in enumerate(order):
         running = max(running, found[i].p_value * (len(found) - rank))
         corrected[i] = min(running, 1.0)
-    out = [
-        Dependence(d.signal, d.feature, float(p), d.strength, d.memory) for d, p in zip(found, corrected, strict=True)
-    ]
-    return sorted(out, key=lambda d: (-d.strength, d.p_value))
+    return [replace(d, p_value=float(p)) for d, p in zip(found, corrected, strict=True)]
+
+
+def follows_course(course: Array, features: list[Feature]) -> list[Dependence]:
+    """Return the features that a slow ``course`` (n,) follows, the most significant first.
+
+    Each curve is fitted by generalised least squares, so that an independent wander gets none by chance, which plain
+    regression of two wanders does (Granger and Newbold, J. Econometrics 2, 1974). ``strength`` is the variance of
+    that curve over the variance of the course.
+    """
+    stretches = [(0, course.size)]
+    model = fit_whitener(course, stretches=stretches)
+    white = _without_outliers(whiten(model, course, stretches))
+    power = float(np.var(course))
+    found: list[Dependence] = []
+    for feature in features:
+        columns = whiten(model, feature.columns, stretches)
+        x = columns - columns.mean(axis=0)
+        axes = _axes(x)
+        followed = feature.columns @ (axes @ (axes.T @ (x.T @ (white - white.mean()))))
+        share = float(np.var(followed)) / power if power > 0.0 else 0.0
+        found.append(Dependence(feature.signal, feature.kind, whitened_f(white, columns), share, feature.memory))
+    return sorted(_corrected(found), key=lambda d: d.p_value)
 
 
 def _after_its_curve(e: Array, columns: Array, stretches: list[Span]) -> float:
@@ -154,9 +180,7 @@ def _after_its_curve(e: Array, columns: Array, stretches: list[Span]) -> float:
     size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     left = e - design @ (np.linalg.lstsq(design / size, e, rcond=1e-8)[0] / size)
     model = fit_whitener(left, stretches=stretches)
-    white = whiten(model, e, stretches)
-    limit = 8.0 * 1.4826 * float(np.median(np.abs(white)))
-    return whitened_f(np.clip(white, -limit, limit) if limit > 0 else white, whiten(model, columns, stretches))
+    return whitened_f(_without_outliers(whiten(model, e, stretches)), whiten(model, columns, stretches))
 
 
 def needs_memory(

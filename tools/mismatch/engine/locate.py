@@ -38,11 +38,8 @@ def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> t
     return mean(fitted.residual[output]), signals, problem.recording.dt * k
 
 
-def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
-    """Return the features that the residual of an output follows, strongest first, and the p-value of no memory.
-
-    Both the mean and the size of the residual are tested: the mean of bursts follows nothing, but their size may.
-    """
+def tested_features(problem: Problem, fitted: Fit, output: str) -> tuple[Array, list[Feature]]:
+    """Return the thinned residual (n,) of an output and all features that it may follow."""
     e, signals, dt = thinned(problem, fitted, output)
     # friction, springs and play follow a plant's own motion; a gain follows a reading that is made of several inputs
     motion = problem.measured[output] - fitted.residual[output]
@@ -52,7 +49,15 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
         alike(standard(motion), standard(signals[i])) for i in problem.twin.inputs if i in signals
     ):
         signals[output] = motion
-    features = features_of(signals, dt, drive=problem.twin.drive(output), motion=output)
+    return e, features_of(signals, dt, drive=problem.twin.drive(output), motion=output)
+
+
+def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
+    """Return the features that the residual of an output follows, strongest first, and the p-value of no memory.
+
+    Both the mean and the size of the residual are tested: the mean of bursts follows nothing, but their size may.
+    """
+    e, features = tested_features(problem, fitted, output)
     found = dependences(e, features)
     present = [f for f in features if not f.memory and f.kind in ("value", "rate")]
     past = [f for f in features if f.memory and f.kind in ("running extremum", "recent history", "amplitude")]

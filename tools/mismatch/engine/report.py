@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
 Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
 """Meaning of the verdict ``unexplained``; "" for the other verdicts."""
-WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance", "unlikely"]
+WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance", "unlikely", "follows_signal"]
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Withheld:
     """Holds an effect that lowered the residual and is not named.
 
     ``shown_by``: the parameters (of ``parameters``, or searched ones) whose interval contains zero or that ended at a
-    limit of the search. ``residual_rms_without`` and ``_with`` are held out; ``replaced_by``: the simpler effect that
-    is named in its place.
+    limit of the search, or the signal that the course of an independent effect follows. ``residual_rms_without`` and
+    ``_with`` are held out; ``replaced_by``: the simpler effect that is named in its place.
     """
 
     name: str

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.dependence import Dependence, dependences
+from tools.mismatch.engine.dependence import Dependence, dependences, follows_course
 from tools.mismatch.engine.features import Feature, alike, curve, rate_of, standard
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.locate import follow, follow_size, thinned
+from tools.mismatch.engine.locate import follow, follow_size, tested_features, thinned
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import winsorised
 
@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 class Leftover:
     """Holds the rest of an output.
 
-    ``ratio`` is the residual mean square over noise variance on held-out samples; ``follows`` lists the features that
+    ``ratio`` is the residual mean square over noise variance, on held-out or fitted samples, whichever is larger;
+    ``follows`` lists the features that
     it follows, strongest first; ``memory_p`` is the p-value of no memory; ``real`` is True if the rest is more than
     noise of any colour.
     """
@@ -45,8 +46,13 @@ def leftover(
 ) -> Leftover:
     """Judge the rest of an output."""
     s = problem.sigma(output)
-    r = winsorised(fitted.residual[output][problem.held_rows], s, problem.lively[problem.held_rows])
-    ratio = float(np.mean((r / s) ** 2))
+
+    def mean_square(rows: NDArray[np.int64]) -> float:
+        r = winsorised(fitted.residual[output][rows], s, problem.lively[rows])
+        return float(np.mean((r / s) ** 2))
+
+    # what a fit leaves on its own samples is no less real
+    ratio = max(mean_square(problem.held_rows), mean_square(problem.fit_rows))
     found, memory = follow(problem, fitted, output)
     significant = [d for d in found if d.p_value < p_limit and d.strength > least]
     followed = any(d.feature != "time itself" for d in significant)
@@ -113,6 +119,17 @@ def lead(problem: Problem, fitted: Fit, output: str, *, least: float = 0.3, p_li
     used = {s for p in fitted.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
     return _plainest(problem, fitted, output, names, p_limit, lambda share: share > least)
+
+
+LEAST_LEAD = 0.1
+"""Least share of a residual that a free curve must explain to be a rival of effects."""
+
+
+def led_by(problem: Problem, fitted: Fit, output: str, course: Array, *, p_limit: float = 1e-3) -> str:
+    """Return the signal that the ``course`` (m,) of an output follows, and "" if there is none."""
+    e, features = tested_features(problem, replace(fitted, residual={**fitted.residual, output: course}), output)
+    found = follows_course(e, [f for f in features if f.signal != "time"])
+    return next((d.signal for d in found if d.p_value < p_limit and d.strength > LEAST_LEAD), "")
 
 
 def block_means(x: Array, dt: float, problem: Problem) -> Array:

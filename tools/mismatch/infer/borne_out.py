@@ -19,6 +19,8 @@ from tools.mismatch.infer.store import Scored, Store
 Values = dict[str, dict[str, ParameterValue]]
 
 
+TRIED = 3
+"""Number of sets, best first, whose effects that follow a signal without being defined by one are reported."""
 Out = Callable[[Scored], bool]
 """Returns True for a set that is no candidate any more."""
 
@@ -52,6 +54,12 @@ def borne_out(
         rest = store.without(s, lambda e, doubted=doubted: e.effect.name in doubted)
         for d in doubts:
             withheld.setdefault(s.placed[d.k].effect.name, _entry(store, s, d, values, rest.names))
+    for s in store.every_ranked()[:TRIED]:
+        if s.names and (found := store.dependent(s)) is not None:
+            effect, signal = found
+            withheld.setdefault(
+                effect.effect.name, entry_of(store, s, Doubt(s.placed.index(effect), "follows_signal", (signal,)))
+            )
     return left, tuple(w for name, w in withheld.items() if name not in left[0].names)
 
 

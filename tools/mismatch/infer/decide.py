@@ -15,7 +15,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
+from tools.mismatch.engine.unexplained import LEAST_LEAD, Leftover, Stranger, about, lead, leftover
 from tools.mismatch.infer.borne_out import Out, borne_out, entry_of
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
@@ -33,8 +33,6 @@ CURVE = 12
 """Number of parameters charged for a free curve of a signal: the columns of a product of a curve and a mover."""
 LOUD = 1.5
 """Ratio of the mean square of the residual to that of the loudest noise above which it is more than noise."""
-LEAST_LEAD = 0.1
-"""Least share of a residual that a free curve must explain to be a rival of effects."""
 
 
 @dataclass(frozen=True)

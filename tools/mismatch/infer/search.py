@@ -235,7 +235,9 @@ class Search:
             if not self.can_be_beaten(ranked[0]):
                 return
             best = self.store.score(ranked[0])
-            beam = [s for s in ranked[:BEAM] if s.key not in self.expanded and self.can_gain(s, best)]
+            # beside the physics that its course follows an independent effect may stand
+            wide = self.store.every_ranked()[:BEAM]
+            beam = [s for s in wide if s.key not in self.expanded and self.can_gain(s, best)]
             chosen = next((s for s in beam if self.store.score(s) - base >= HALF * (best - base)), None)
             if chosen is None:
                 return

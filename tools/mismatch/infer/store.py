@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
+from tools.mismatch.engine.unexplained import led_by
 from tools.mismatch.engine.vary import added, beyond_limits, size, stripped, with_balance
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.count import Count
@@ -27,6 +28,7 @@ from tools.mismatch.infer.density import (
     follower,
     gain_of_events,
     priced_likelihood,
+    undone,
     unpredicted,
     walks,
     weigh,
@@ -91,6 +93,7 @@ class Store:
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
         self._ahead: dict[tuple[Key, str], float] = {}
+        self._dependent: dict[Key, tuple[Placed, str] | None] = {}
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
         self.outputs = float(len(problem.twin.outputs))
@@ -121,6 +124,7 @@ class Store:
             for known in (self._tests, self._ahead):
                 for of in [of for of in known if of[0] == scored.key]:
                     del known[of]
+            self._dependent.pop(scored.key, None)
         return self.sets[scored.key]
 
     def scored(self, fitted: Fit) -> Scored:
@@ -164,7 +168,41 @@ class Store:
         return {o: self._best[o] - d for o, d in s.density.items()}
 
     def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
-        """Return the proper sets, the best of each set of names, best first, without walks that are outdone."""
+        """Return the proper sets, the best of each set of names, best first, without walks that are outdone.
+
+        Of the first ones those are left out in which an independent effect follows a signal.
+        """
+        left = self.every_ranked(sets)
+        first: list[Scored] = []
+        for k, s in enumerate(left):
+            if len(first) == CHECKED:
+                return [*first, *left[k:]]
+            if self.dependent(s) is None:
+                first.append(s)
+        return first
+
+    def dependent(self, s: Scored) -> tuple[Placed, str] | None:
+        """Return an effect of ``s`` that depends on no signal by its definition, and the signal that it follows.
+
+        A course by a cause of its own follows no signal. What does stands for physics that is missing.
+        """
+        if s.key not in self._dependent:
+            with np.errstate(all="ignore"):
+                self._dependent[s.key] = next(self._follow(s), None)
+        return self._dependent[s.key]
+
+    def _follow(self, s: Scored) -> Iterator[tuple[Placed, str]]:
+        for k, placed in enumerate(s.placed):
+            # what passes the dynamics of a plant follows its motion
+            if placed.site != "output" or not placed.effect.is_independent or placed.effect.claims is not None:
+                continue
+            for o in placed.outputs:
+                course = undone(self.problem, s.fitted, o, [k])
+                if np.all(np.isfinite(course)) and (signal := led_by(self.problem, s.fitted, o, course)):
+                    yield placed, signal
+
+    def every_ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
+        """Return the proper sets as ``ranked`` does, with those in which an independent effect follows a signal."""
         best: dict[frozenset[str], Scored] = {}
         for s in self.sets.values() if sets is None else sets:
             if s.proper and (s.names not in best or self.score(s) > self.score(best[s.names])):
@@ -356,6 +394,8 @@ def outputs_at_odds(room: Sequence[float]) -> float:
     return float(np.sum(left)) ** 2 / squares if squares > 0.0 else float(left.size)
 
 
+CHECKED = 6
+"""Number of sets, best first, of which none has an independent effect that follows a signal."""
 EDGE = 1.001
 """Residual, in steps of the lattice of readings, up to which a sample is no event; above one because of rounding."""
 EVENTS = 2

@@ -330,6 +330,8 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
         why = f"{names} ended at a limit of the search"
     elif w.reason == "unlikely":
         why = "beside what is left unexplained it is too likely to be wrong"
+    elif w.reason == "follows_signal":
+        why = f"it depends on no signal, but what it explains follows {names}"
     else:
         sizes = []
         for n in w.shown_by[:3]:
