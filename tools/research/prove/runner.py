@@ -21,11 +21,11 @@ B = TypeVar("B")
 
 
 def tool(path: Path) -> dict[str, Any]:
-    """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
+    """`micron mismatch diagnose` on one recording, in this process: the JSON report."""
     from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
-    return as_plain(diagnose(load(path)))
+    return as_plain(diagnose(load(path), jobs=1))  # workers of a worker may keep it from ending
 
 
 def as_plain(report: Any) -> dict[str, Any]:
