@@ -128,7 +128,7 @@ LEAST_LEAD = 0.1
 def led_by(problem: Problem, fitted: Fit, output: str, course: Array, *, p_limit: float = 1e-3) -> str:
     """Return the signal that the ``course`` (m,) of an output follows, and "" if there is none."""
     e, features = tested_features(problem, replace(fitted, residual={**fitted.residual, output: course}), output)
-    found = follows_course(e, [f for f in features if f.signal != "time"])
+    found = follows_course(e, [f for f in features if f.kind != "time itself"])
     return next((d.signal for d in found if d.p_value < p_limit and d.strength > LEAST_LEAD), "")
 
 
