@@ -51,6 +51,8 @@ Array = NDArray[np.float64]
 NODE_S = 1e-3
 """A hand is given by nodes this far apart."""
 _JERK_PAUSE_S = 1.0
+PLANNED = 64
+"""Number of reaches, and of jerks, that are planned at a time."""
 POSE_HOLD_S = 1.5
 """Rest in each calibration pose, beside ``hold_s``: a second of it is taken."""
 
@@ -145,7 +147,12 @@ class SyntheticHand:
         p["integral_drive"] = designs[times[FREQUENCY]].integral_drive
         self._s[0]["phase"] = start.uniform(0.0, 2.0 * math.pi)
         self._noise = stream(seed, "hand.noise")
-        self._plan(600.0)
+        self._reaching = stream(seed, "hand.reaches")
+        self._jerking = stream(seed, "hand.jerk.times"), stream(seed, "hand.jerk.sizes")
+        self._reaches, self._jerks = np.zeros((0, 14)), np.zeros((0, 5))
+        self._reached, self._reached_s, self._jerked_s = 0, 0.0, 0.0
+        self._plan_reaches()
+        self._plan_jerks()
 
     @property
     def tremor_frequency_hz(self) -> float:
@@ -157,37 +164,48 @@ class SyntheticHand:
 
     def fill(self, pose: Array, parts: Array) -> None:
         end_s = (int(self._s[0]["step"]) + pose.shape[0]) * NODE_S
-        while end_s > self._planned_s:
-            self._plan(2.0 * self._planned_s)
+        while end_s > self._reaches[-1, 0]:
+            self._plan_reaches()
+        while end_s > self._jerks[-1, 0]:
+            self._plan_jerks()
         noise = self._noise.standard_normal((pose.shape[0], PROCESSES))
         hand_nodes(self._p, self._s, noise, (self._reaches, self._jerks), pose, parts)
 
-    def _plan(self, seconds: float) -> None:
-        """Plan reaches and jerks for at least ``seconds``. A longer plan begins with the shorter one."""
-        config = self._config
-        count = int(seconds / config.reach_s[0]) + 2
-        draw = stream(self._seed, "hand.reaches").random((count, 8))
+    def _plan_reaches(self) -> None:
+        """Plan the next reaches and drop those that are over."""
+        config, past = self._config, int(self._s[0]["reach"])
+        draw = self._reaching.random((PLANNED, 8))
         duration = config.reach_s[0] + (config.reach_s[1] - config.reach_s[0]) * draw[:, 0]
         hold = config.hold_s[0] + (config.hold_s[1] - config.hold_s[0]) * draw[:, 1]
         size = np.repeat([config.voluntary_range_um * 1e-6, math.radians(config.voluntary_angle_deg)], 3)
         target = (2.0 * draw[:, 2:] - 1.0) * size
         if config.performs == "poses":
             hold += POSE_HOLD_S
-            target[:, 3:] += pose_angles()[np.arange(count) % len(pose_angles())]
-        self._reaches = np.zeros((count, 14))
-        self._reaches[:, 0] = np.cumsum(hold + duration) - duration
-        self._reaches[:, 1] = duration
-        self._reaches[1:, 2:8] = target[:-1]
-        self._reaches[:, 8:] = target
+            target[:, 3:] += pose_angles()[(self._reached + np.arange(PLANNED)) % len(pose_angles())]
+        ends_s = np.cumsum(np.concatenate([[self._reached_s], hold + duration]))[1:]
+        more = np.zeros((PLANNED, 14))
+        more[:, 0] = ends_s - duration
+        more[:, 1] = duration
+        more[0, 2:8] = self._reaches[-1, 8:] if len(self._reaches) else 0.0
+        more[1:, 2:8] = target[:-1]
+        more[:, 8:] = target
+        self._reaches = np.concatenate([self._reaches[past:], more])
+        self._s[0]["reach"] = 0
+        self._reached, self._reached_s = self._reached + PLANNED, float(ends_s[-1])
 
-        count = int(seconds / _JERK_PAUSE_S) + 2
-        wait = stream(self._seed, "hand.jerk.times").exponential(config.jerk_interval_s, count)
-        shape = stream(self._seed, "hand.jerk.sizes").standard_normal((count, 4))
-        self._jerks = np.zeros((count, 5))
-        self._jerks[:, 0] = np.cumsum(wait + _JERK_PAUSE_S)
-        self._jerks[:, 1] = 0.035 * np.exp(0.2 * shape[:, 0])
-        self._jerks[:, 2:] = config.jerk_um * 1e-6 / math.sqrt(3.0) * shape[:, 1:]
-        self._planned_s = seconds
+    def _plan_jerks(self) -> None:
+        """Plan the next jerks and drop those that are over."""
+        config, past = self._config, int(self._s[0]["jerk"])
+        times, sizes = self._jerking
+        wait_s = times.exponential(config.jerk_interval_s, PLANNED)
+        shape = sizes.standard_normal((PLANNED, 4))
+        more = np.zeros((PLANNED, 5))
+        more[:, 0] = np.cumsum(np.concatenate([[self._jerked_s], wait_s + _JERK_PAUSE_S]))[1:]
+        more[:, 1] = 0.035 * np.exp(0.2 * shape[:, 0])
+        more[:, 2:] = config.jerk_um * 1e-6 / math.sqrt(3.0) * shape[:, 1:]
+        self._jerks = np.concatenate([self._jerks[past:], more])
+        self._s[0]["jerk"] = 0
+        self._jerked_s = float(more[-1, 0])
 
 
 def _ry(a: float) -> Array:

@@ -8,9 +8,10 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from sim_devices.config import HandConfig
-from sim_devices.plant.hand import POSE_HOLD_S, SyntheticHand, holding_frame, pose_angles, tremor_matrix
+from sim_devices.plant.hand import PLANNED, POSE_HOLD_S, SyntheticHand, holding_frame, pose_angles, tremor_matrix
 from sim_devices.plant.hand_kernel import between, hand_nodes, hand_pose, jerk_motion, pose_between, reach_motion
 from sim_devices.plant.smooth_noise import smooth_noise
+from sim_devices.plant.streams import stream
 
 
 def motion(config, seed, milliseconds, block=None):
@@ -145,15 +146,6 @@ def test_same_seed_same_hand_whatever_the_blocks():
     assert not np.array_equal(a, c)
 
 
-def test_the_plan_goes_on_beyond_its_first_ten_minutes():
-    hand = SyntheticHand(HandConfig(), 1)
-    before = hand._reaches.copy()
-    hand._plan(1200.0)
-    assert np.array_equal(hand._reaches[: len(before)], before)
-    assert hand._reaches[-1, 0] > 1200.0
-    assert hand._jerks[-1, 0] > 1200.0
-
-
 def test_no_tremor_when_none_is_asked_for():
     _, parts = motion(HandConfig(tremor_pp_um=0.0), 1, 100)
     assert not parts[:, 3:].any()
@@ -194,3 +186,22 @@ def test_calibration_poses_are_every_half_axis_and_octant_once_and_are_held():
     rests = [k * 2500 for k in range(1, 15)]  # each reach ends here and the next begins after POSE_HOLD_S
     assert np.allclose(pose[rests, 3:6], pose_angles(), atol=1e-12)
     assert np.ptp(pose[2500 : 2500 + round(1000 * POSE_HOLD_S), 3:6], axis=0).max() == 0.0
+
+
+def test_a_long_run_keeps_few_reaches_and_they_are_those_of_a_plan_in_one_go() -> None:
+    config, seed, n = HandConfig(), 7, 1500
+    hand = SyntheticHand(config, seed)
+    pose, parts = np.zeros((256, 18)), np.zeros((256, 6))
+    seen: dict[float, np.ndarray] = {}
+    while len(seen) < n:
+        hand.fill(pose, parts)
+        seen |= {float(row[0]): row for row in hand._reaches}
+        assert len(hand._reaches) <= 2 * PLANNED
+        assert len(hand._jerks) <= 2 * PLANNED
+    draw = stream(seed, "hand.reaches").random((n, 8))
+    duration_s = config.reach_s[0] + (config.reach_s[1] - config.reach_s[0]) * draw[:, 0]
+    hold_s = config.hold_s[0] + (config.hold_s[1] - config.hold_s[0]) * draw[:, 1]
+    found = np.array([seen[t] for t in sorted(seen)[:n]])
+    np.testing.assert_array_equal(found[:, 0], np.cumsum(hold_s + duration_s) - duration_s)
+    np.testing.assert_array_equal(found[1:, 2:8], found[:-1, 8:])
+    np.testing.assert_array_equal(np.sign(found[:, 8:]), np.sign(2.0 * draw[:, 2:] - 1.0))
