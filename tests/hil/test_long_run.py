@@ -41,7 +41,7 @@ def test_the_last_hour_of_a_shift_is_like_the_first() -> None:
 def run_of(**changes: object) -> LongRun:
     table: dict[str, object] = {
         "wires": True, "seconds": 80.0, "start_ns": 0, "cpu_s": 1.0, "left_um": [2.0] * 8, "tremor_um": [20.0] * 8,
-        "tilt_mrad": None, "memory_MB": [100.0] * 8, "marks": [], "counters": {"samples lost": 0},
+        "tilt_mrad": None, "memory_MB": [100.0] * 8, "scatter": 0.02, "marks": [], "counters": {"samples lost": 0},
         "ended": "run finished",
     }  # fmt: skip
     return LongRun(**{**table, **changes})  # type: ignore[arg-type]

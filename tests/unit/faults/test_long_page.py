@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.errors import InputError
 from tools.research.faults.long_page import with_block
+from tools.research.faults.long_run import EIGHTHS, PARTS, Eighths
 
 
 def test_a_block_replaces_its_own_and_leaves_the_other(tmp_path: Path):
@@ -34,3 +36,18 @@ def test_a_start_of_the_clock_needs_a_clock():
     result = CliRunner().invoke(app, ["soak", "--without-wires", "--start-ns", "5"])
     assert result.exit_code == 2
     assert "--start-ns moves the clock of the buses" in result.stderr
+
+
+def test_the_scatter_of_an_eighth_is_that_of_the_eighths():
+    """The peer is the standard deviation of the eighths of many runs whose tremor wanders."""
+    rng = np.random.default_rng(2)
+    seen, said = list[float](), list[float]()
+    for _ in range(40):
+        run = Eighths(EIGHTHS * PARTS * 100.0)
+        for k in range(EIGHTHS * PARTS):
+            left = rng.normal(0.0, 1e-6 * (1.0 + 0.4 * rng.random()), (40, 3))
+            run.add(100.0 * k + 50.0, left, rng.normal(0.0, 3e-6, (40, 3)))
+        part = np.array(run.rms(1, 1.0)) / np.array(run.rms(2, 1.0))
+        seen.append(float(np.std(part, ddof=1) / np.median(part)))
+        said.append(run.scatter)
+    assert np.mean(said) == pytest.approx(np.mean(seen), rel=0.25)

@@ -6,17 +6,17 @@ import re
 from pathlib import Path
 
 from tools.errors import InputError
-from tools.research.faults.long_run import DRIFT, GROWTH_MB, LongRun
+from tools.research.faults.long_run import CHANCE, DRIFT, GROWTH_MB, LongRun
 from tools.research.results.artefact import read_page
 
 HEAD = f"""# Long runs: what grows, what drifts, what is not counted
 
 Each block is made by the command that it names. Virtual time, scored by eighths of the run. Asked for: memory grows by
 less than {GROWTH_MB:g} MB after the first eighth, the part of the tremor that is left stays within {DRIFT:.0%} of its
-median, every sample and every tick is accounted for, nothing is noticed. What is left is the tip's distance from the
-path that the hand intends, tremor the same without compensation; both without their mean over a fifth of a second, at
-all frequencies (8 to 12 Hz alone: `micron run`). `tests/hil/test_time_marks.py` asks that runs across 2^31, 2^32 and
-2^53 ns be the run from zero, bit for bit.
+median (of a short run: within {CHANCE:g} standard errors), every sample and every tick is accounted for, nothing is
+noticed. What is left is the tip's distance from the path that the hand intends, tremor the same without compensation;
+both without their mean over a fifth of a second, at all frequencies (8 to 12 Hz alone: `micron run`).
+`tests/hil/test_time_marks.py` asks that runs across 2^31, 2^32 and 2^53 ns be the run from zero, bit for bit.
 """
 
 
@@ -38,8 +38,8 @@ def block(run: LongRun, command: str, revision: str) -> str:
     counters = ", ".join(f"{name} {value}" for name, value in run.counters.items())
     return (
         f"## {hours}, {form}\n\n`{command}`, firmware revision {revision}; {run.cpu_s / 60:.1f} min on one core.\n\n"
-        f"{table}\n\nMemory grew by {run.growth_MB:.2f} MB; left varied by {100 * run.drift:.1f} % of its median. "
-        f"{marks}Counters: {counters}. Ended: {run.ended}. "
+        f"{table}\n\nMemory grew by {run.growth_MB:.2f} MB; left varied by {100 * run.drift:.1f} % of its median "
+        f"(standard error {100 * run.scatter:.1f} %). {marks}Counters: {counters}. Ended: {run.ended}. "
         f"{'Not as asked for: ' + '; '.join(run.problems()) if run.problems() else 'All as asked for'}.\n"
     )
 

@@ -28,10 +28,13 @@ from tools.closed_loop.simulate import simulate
 
 Array = NDArray[np.float64]
 EIGHTHS = 8
+PARTS = 8
+"""Number of parts of an eighth, whose scatter says how much an eighth varies by chance."""
 SETTLE_S = 5.0
 BLOCK = 200  # ticks in which a mean is taken out: two periods of tremor
 GROWTH_MB = 2.0
 DRIFT = 0.25  # of the median part of the tremor that is left
+CHANCE = 4.0  # standard errors of an eighth that a drift exceeds: of eight, one in 2000 does by chance
 MARKS_NS = {"2^31": 2**31, "2^32": 2**32, "2^53": 2**53}
 AT = {name: slice(at, at + n) for name, at, n in TRUTH}
 
@@ -39,7 +42,8 @@ AT = {name: slice(at, at + n) for name, at, n in TRUTH}
 @dataclass(frozen=True)
 class LongRun:
     """``left_um``, ``tremor_um`` (8,): rms by eighths; ``tilt_mrad`` (8,) or None where the run does not say.
-    ``memory_MB`` (8,): resident at the end of each eighth. ``marks``: those of bench time that the run crossed."""
+    ``memory_MB`` (8,): resident at the end of each eighth. ``scatter``: standard error of the part that is left in an
+    eighth, relative to the median, from parts of eighths. ``marks``: those of bench time that the run crossed."""
 
     wires: bool
     seconds: float
@@ -49,6 +53,7 @@ class LongRun:
     tremor_um: list[float]
     tilt_mrad: list[float] | None
     memory_MB: list[float]
+    scatter: float
     marks: list[str]
     counters: dict[str, Any]
     ended: str
@@ -70,7 +75,7 @@ class LongRun:
         found: list[str] = []
         if self.growth_MB > GROWTH_MB:
             found.append(f"memory grew by {self.growth_MB:.1f} MB")
-        if self.drift > DRIFT:
+        if self.drift > max(DRIFT, CHANCE * self.scatter):
             found.append(f"what is left of the tremor varied by {100 * self.drift:.0f} %")
         if empty := sum(tremor == 0.0 for tremor in self.tremor_um):
             found.append(f"nothing was seen in {empty} of {EIGHTHS} eighths")
@@ -116,16 +121,16 @@ class Eighths:
     """Sums over equal parts of a run of ``seconds``: what is left of the tremor, the tremor, error of the tilt."""
 
     seconds: float
-    sums: Array = field(default_factory=lambda: np.zeros((EIGHTHS, 4)))
+    sums: Array = field(default_factory=lambda: np.zeros((EIGHTHS, PARTS, 4)))
     memory_MB: Array = field(default_factory=lambda: np.zeros(EIGHTHS))
 
     def add(self, t_s: float, left_m: Array, tremor_m: Array, tilt_rad: Array | None = None) -> None:
         """``left_m``, ``tremor_m`` (n, 3): of the tip, about ``t_s`` after the start; their mean is taken out."""
-        eighth = min(EIGHTHS - 1, int(t_s / self.seconds * EIGHTHS))
-        self.memory_MB[eighth] = resident_MB()
+        at = min(EIGHTHS * PARTS - 1, int(t_s / self.seconds * EIGHTHS * PARTS))
+        self.memory_MB[at // PARTS] = resident_MB()
         if t_s < SETTLE_S:
             return
-        self.sums[eighth] += (
+        self.sums[at // PARTS, at % PARTS] += (
             len(left_m),
             np.sum((left_m - left_m.mean(0)) ** 2),
             np.sum((tremor_m - tremor_m.mean(0)) ** 2),
@@ -133,7 +138,16 @@ class Eighths:
         )
 
     def rms(self, column: int, factor: float) -> list[float]:
-        return (factor * np.sqrt(self.sums[:, column] / np.maximum(self.sums[:, 0], 1.0))).tolist()
+        sums = self.sums.sum(axis=1)
+        return (factor * np.sqrt(sums[:, column] / np.maximum(sums[:, 0], 1.0))).tolist()
+
+    @property
+    def scatter(self) -> float:
+        """Return the standard error of the part of the tremor that is left in an eighth, relative to the median."""
+        left, tremor = self.sums[..., 1], self.sums[..., 2]
+        part = np.sqrt(left / np.where(tremor > 0.0, tremor, np.nan))
+        spread = np.sqrt(np.nanmean(np.nanvar(part, axis=1, ddof=1)) / PARTS)
+        return float(spread / np.nanmedian(part))
 
 
 def with_wires(
@@ -164,6 +178,7 @@ def with_wires(
         tremor_um=eighths.rms(2, 1e6),
         tilt_mrad=None,
         memory_MB=eighths.memory_MB.tolist(),
+        scatter=eighths.scatter,
         marks=[name for name, ns in MARKS_NS.items() if start_ns < ns < int(truth["t_ns"][-1])],
         counters={
             "samples received": samples["received"],
@@ -202,6 +217,7 @@ def without_wires(bench: Path, seconds: float, *, on_time: Callable[[float], Non
         tremor_um=eighths.rms(2, 1e6),
         tilt_mrad=eighths.rms(3, 1e3),
         memory_MB=eighths.memory_MB.tolist(),
+        scatter=eighths.scatter,
         marks=[],  # the compiled loop counts ticks, and has no clock that could wrap
         counters={**counted, "commands clipped": run.clipped},
         ended="run finished",
