@@ -19,8 +19,6 @@ from tools.mismatch.infer.store import Scored, Store
 Values = dict[str, dict[str, ParameterValue]]
 
 
-TRIED = 3
-"""Number of sets, best first, whose effects that follow a signal without being defined by one are reported."""
 Out = Callable[[Scored], bool]
 """Returns True for a set that is no candidate any more."""
 
@@ -32,7 +30,8 @@ def borne_out(
     effects.
 
     A set with an effect all of whose sizes may be zero is no candidate, and neither is a larger one; beside fewer
-    others the same effect may be sure. The set without the effect is fitted, and ranked with the others.
+    others the same effect may be sure. The set without the effect is fitted, and ranked with the others. Effects that
+    follow a signal without being defined by one are withheld where their set is the better one.
     """
     gone, withheld = list[Out](), dict[str, Withheld]()
     given = as_given(store.problem).residual
@@ -54,8 +53,10 @@ def borne_out(
         rest = store.without(s, lambda e, doubted=doubted: e.effect.name in doubted)
         for d in doubts:
             withheld.setdefault(s.placed[d.k].effect.name, _entry(store, s, d, values, rest.names))
-    for s in store.every_ranked()[:TRIED]:
-        if s.names and (found := store.dependent(s)) is not None:
+    for s in store.every_ranked():
+        if s.key == left[0].key:
+            break
+        if (found := store.dependent(s)) is not None:
             effect, signal = found
             withheld.setdefault(
                 effect.effect.name, entry_of(store, s, Doubt(s.placed.index(effect), "follows_signal", (signal,)))
