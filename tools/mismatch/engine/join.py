@@ -52,7 +52,7 @@ def joined(recording: Recording) -> tuple[Recording, bool]:
             context={
                 s: np.concatenate([x, second.context[s]]) for s, x in first.context.items() if s in second.context
             },
-            split=Split(fit, test, {}, initialization),
+            split=Split(fit, test, initialization),
             segments=(*first.segments, *(first.n + s for s in second.segments)),
         ),
         True,
