@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import IO
 
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hal.bench import BenchFile
 from hal.children import child_command, child_environment
-from tools.terminal import progress_bar
 
 WAVES: tuple[tuple[str, ...], ...] = (("instrument", "tremor"), ("step",))
 """Parts that are compiled beside each other. The step needs the others' stages and is compiled last."""
@@ -36,7 +35,8 @@ def prepare(bench: BenchFile, method: str | None, console: Console) -> None:
     if marker.exists():
         return
     columns = TextColumn("compiling, once on this machine"), BarColumn(24), TimeElapsedColumn(), TimeRemainingColumn()
-    with progress_bar(console, *columns) as progress:
+    # in a pipe Rich's own prints an empty line at its end
+    with Progress(*columns, console=console, transient=True, disable=not console.is_interactive) as progress:
         bar = progress.add_task("compile", total=sum(EXPECTED.values()))
         done = 0
         for wave in WAVES:
