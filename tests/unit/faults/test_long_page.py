@@ -42,7 +42,7 @@ def test_the_scatter_of_an_eighth_is_that_of_the_eighths():
     """The peer is the standard deviation of the eighths of many runs whose tremor wanders."""
     rng = np.random.default_rng(2)
     seen, said = list[float](), list[float]()
-    for _ in range(40):
+    for _ in range(100):
         run = Eighths(EIGHTHS * PARTS * 100.0)
         for k in range(EIGHTHS * PARTS):
             left = rng.normal(0.0, 1e-6 * (1.0 + 0.4 * rng.random()), (40, 3))
@@ -50,4 +50,6 @@ def test_the_scatter_of_an_eighth_is_that_of_the_eighths():
         part = np.array(run.rms(1, 1.0)) / np.array(run.rms(2, 1.0))
         seen.append(float(np.std(part, ddof=1) / np.median(part)))
         said.append(run.scatter)
-    assert np.mean(said) == pytest.approx(np.mean(seen), rel=0.25)
+    # of eight eighths a standard deviation is too small in the mean, and its square is not
+    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(np.sqrt(np.mean(np.square(seen))), rel=0.1)
+    assert Eighths(60.0).scatter == 0.0

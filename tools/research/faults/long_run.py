@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import os
 import time
 from collections.abc import Callable
@@ -143,11 +144,14 @@ class Eighths:
 
     @property
     def scatter(self) -> float:
-        """Return the standard error of the part of the tremor that is left in an eighth, relative to the median."""
+        """Return the standard error of the part of the tremor that is left in an eighth, relative to the median.
+
+        It is 0 where no eighth has two parts that were seen: then nothing is excused.
+        """
         left, tremor = self.sums[..., 1], self.sums[..., 2]
-        part = np.sqrt(left / np.where(tremor > 0.0, tremor, np.nan))
-        spread = np.sqrt(np.nanmean(np.nanvar(part, axis=1, ddof=1)) / PARTS)
-        return float(spread / np.nanmedian(part))
+        parts = [np.sqrt(a[b > 0.0] / b[b > 0.0]) for a, b in zip(left, tremor, strict=True)]
+        errors = [float(np.var(p, ddof=1)) / p.size for p in parts if p.size > 1]
+        return math.sqrt(sum(errors) / len(errors)) / float(np.median(np.concatenate(parts))) if errors else 0.0
 
 
 def with_wires(
