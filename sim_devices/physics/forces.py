@@ -36,13 +36,17 @@ def friction_limit(v, sign, row, at):
     """Return the largest friction at speed v in the direction ``sign``: Coulomb, its asymmetry, Stribeck's extra.
 
     F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3. With
-    ``row[at + 7]`` the exponent is -|v|/vs (A. Tustin, J. IEE 94 IIA (1947) 143).
+    ``row[at + 7]`` = 1 the extra is Fs exp(-|v|/vs) (A. Tustin, J. IEE 94 IIA (1947) 143), with 2 Fs / (1 + (v/vs)^2)
+    (D. P. Hess, A. Soom, J. Tribology 112 (1990) 147).
     The numbers of the family begin at ``row[at]``.
     """
     f = row[at] + sign * row[at + 1]
     if row[at + 2] != 0.0 and row[at + 3] > 0.0:
         r = abs(v) / row[at + 3]
-        f += row[at + 2] * np.exp(-r if row[at + 7] != 0.0 else -r * r)
+        if row[at + 7] == 2.0:
+            f += row[at + 2] / (1.0 + r * r)
+        else:
+            f += row[at + 2] * np.exp(-r if row[at + 7] == 1.0 else -r * r)
     return f
 
 

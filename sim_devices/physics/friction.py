@@ -294,14 +294,19 @@ def _stribeck_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Arr
     return np.column_stack([_coulomb_basis(x, ctx, q, settings), extra])
 
 
-def _tustin_parts(settings: Settings) -> Parts:
+def _renamed_parts(settings: Settings, name: str) -> Parts:
     parts = _stribeck_parts(settings)
-    return replace(parts, nonlinear=(replace(parts.nonlinear[0], name="decay_speed"),))
+    return replace(parts, nonlinear=(replace(parts.nonlinear[0], name=name),))
 
 
 def _tustin_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     v = velocity_of(x, ctx)
     return np.column_stack([_coulomb_basis(x, ctx, q, settings), -soft_sign(v) * np.exp(-np.abs(v) / q[0])])
+
+
+def _slow_fall_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    v = velocity_of(x, ctx)
+    return np.column_stack([_coulomb_basis(x, ctx, q, settings), -soft_sign(v) / (1.0 + (v / q[0]) ** 2)])
 
 
 def _stribeck_fill(q: Array, w: Array, settings: Settings, law: float = 0.0) -> dict[str, Array]:
@@ -327,8 +332,8 @@ def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Hum
     )
 
 
-def _stribeck_bristle_parts(settings: Settings) -> Parts:
-    speed = _stribeck_parts(settings).nonlinear[0]
+def _stribeck_bristle_parts(settings: Settings, name: str = "stribeck_speed") -> Parts:
+    speed = _renamed_parts(settings, name).nonlinear[0]
     return Parts((speed, _bristle_distance(settings)), (Parameter("level", _UNIT, 0.0), Parameter("extra", _UNIT, 0.0)))
 
 
@@ -336,6 +341,15 @@ def _stribeck_bristle_basis(x: Array, ctx: Context, q: Array, settings: Settings
     bent = _bent(x, ctx, q[1])
     v = velocity_of(x, ctx)
     return -np.stack([bent, bent * np.exp(-((v / q[0]) ** 2))], axis=1)
+
+
+def _slow_fall_bristle_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    bent = _bent(x, ctx, q[1])
+    return -np.stack([bent, bent / (1.0 + (velocity_of(x, ctx) / q[0]) ** 2)], axis=1)
+
+
+def _stribeck_bristle_fill(q: Array, w: Array, settings: Settings, law: float = 0.0) -> dict[str, Array]:
+    return packed("friction", FRICTION, {0: w[0], 2: w[1], 3: q[0], 5: max(w[0], 0.0) / q[1], 7: law})
 
 
 def _stribeck_bristle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -380,11 +394,21 @@ _SQUARED = Effect(
 _TUSTIN = replace(
     _SQUARED,
     summary="friction that falls as motion starts, at first quickly and then slowly",
-    parts=_tustin_parts,
+    parts=partial(_renamed_parts, name="decay_speed"),
     equation=r"m\ddot x = F - \left(F_c + F_s e^{-|\dot x|/v_s}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
     source="A. Tustin, J. IEE 94 IIA (1947) 143; " + _FRICTION_SOURCE,
     basis=_tustin_basis,
     fill=partial(_stribeck_fill, law=1.0),
+)
+
+_SLOW_FALL = replace(
+    _SQUARED,
+    summary="friction that falls as motion starts, with a long tail at speed",
+    parts=partial(_renamed_parts, name="half_speed"),
+    equation=r"m\ddot x = F - \left(F_c + F_s / (1 + (\dot x/v_s)^2)\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
+    source="D. P. Hess, A. Soom, J. Tribology 112 (1990) 147; " + _FRICTION_SOURCE,
+    basis=_slow_fall_basis,
+    fill=partial(_stribeck_fill, law=2.0),
 )
 
 _STRIBECK_BRISTLES = replace(
@@ -397,8 +421,23 @@ _STRIBECK_BRISTLES = replace(
     prepare=_bristle_settings,
     guess=_stribeck_bristle_guess,
     basis=_stribeck_bristle_basis,
-    fill=lambda q, w, settings: packed("friction", FRICTION, {0: w[0], 2: w[1], 3: q[0], 5: max(w[0], 0.0) / q[1]}),
+    fill=_stribeck_bristle_fill,
     report=_stribeck_bristle_report,
 )
 
-STRIBECK_FRICTION = replace(_SQUARED, confusable_with=("coulomb_friction",), variants=(_TUSTIN, _STRIBECK_BRISTLES))
+_SLOW_FALL_BRISTLES = replace(
+    _STRIBECK_BRISTLES,
+    summary=_SLOW_FALL.summary + ", behind bristles that give way over a small distance",
+    parts=partial(_stribeck_bristle_parts, name="half_speed"),
+    equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z /"
+    r" (F_c + F_s / (1 + (\dot x/v_s)^2))",
+    source=_LUGRE_SOURCE + "; " + _SLOW_FALL.source,
+    basis=_slow_fall_bristle_basis,
+    fill=partial(_stribeck_bristle_fill, law=2.0),
+)
+
+STRIBECK_FRICTION = replace(
+    _SQUARED,
+    confusable_with=("coulomb_friction",),
+    variants=(_TUSTIN, _SLOW_FALL, _STRIBECK_BRISTLES, _SLOW_FALL_BRISTLES),
+)

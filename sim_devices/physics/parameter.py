@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -51,6 +51,18 @@ def _turned_report(p: Array, settings: Settings, scale: float) -> Sequence[Human
     return (Human("relative_change", float(p[0]), "1"), Human("rising_to_falling", (1 + a) / (1 - a), "1"))
 
 
+def _directions(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.sign(x if settings[PAIRS][2] == OWN_SIGN else np.gradient(x, ctx.dt))[:, None]
+
+
+def _turned(q: Array, w: Array, settings: Settings) -> Mapping[str, Array]:
+    parameter, state, way = settings[PAIRS]
+    return {"sway": np.array([parameter, state, w[0], 0.0, way])}
+
+
+RATE_SIGN, OWN_SIGN = 1.0, 2.0
+"""The direction of a state is the sign of its rate, or of a velocity its own sign."""
+
 MOST_TURNED = 0.95
 """Largest relative change by direction; at 1 the parameter would vanish one way."""
 
@@ -64,9 +76,9 @@ DIRECTION_DEPENDENCE = Effect(
     source="J. C. Dixon, The Shock Absorber Handbook, 2nd ed. 2007, ch. 6 (asymmetry); the same form for any parameter",
     excitation="slow and fast moves both ways, with rest between them",
     confusable_with=("static_nonlinearity", "hysteresis"),
-    prepare=lambda x, residual, ctx: {PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0))},
-    basis=lambda x, ctx, q, settings: np.sign(np.gradient(x, ctx.dt))[:, None],
-    fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], 0.0, 1.0])},
+    prepare=lambda x, residual, ctx: {PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0, RATE_SIGN))},
+    basis=_directions,
+    fill=_turned,
     report=_turned_report,
     limits={"relative_change": (-MOST_TURNED, MOST_TURNED)},
     vanishes_with=(("relative_change",),),

@@ -146,6 +146,8 @@ def test_scoring_reads_units_intervals_and_order() -> None:
     assert [c["covered"] for c in coverage(report, _answer())] == [True]
     report["physics"].reverse()
     assert not score(_answer(), report)["ok"]
+    par["delay_ms"]["unit"] = "um"  # a figure of another dimension is none of the answer's
+    assert coverage(report, _answer(), far_off=True) == []
 
 
 def test_null_harness_counts_and_bounds(tmp_path: Path) -> None:

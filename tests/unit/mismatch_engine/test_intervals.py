@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
-from tools.mismatch.engine.found import human_values
+from tools.mismatch.engine.found import human_values, values_of_forms
 from tools.mismatch.engine.intervals import few_blocks, uncertainty
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.screen import places
@@ -58,6 +58,17 @@ def test_slow_noise_widens_the_interval_of_a_level() -> None:
         half[name] = float(uncertainty(problem, base).deviations()[offset])
     # a mean of AR(1) noise: sqrt((1 + a) / (1 - a)) = 6.2 times as wide
     assert 3.5 < half["slow"] / half["white"] < 9.0
+
+
+def test_an_interval_is_as_wide_around_the_value_of_another_form_that_fits_as_well() -> None:
+    problem, _, base = prepared(stack(0.02 * np.random.default_rng(2).standard_normal(3000)), 0.3, 0, False)
+    unsure, at = uncertainty(problem, base), [p.name for p in base.model.parameters].index("offset_um")
+    alone = human_values(problem, base, unsure)["base"]["offset_um"]
+    other = replace(base, theta=base.theta + 3.0 * np.eye(base.theta.size)[at])
+    both = values_of_forms(problem, base, unsure, [other])["base"]["offset_um"]
+    assert both.value == alone.value
+    assert both.ci95 == pytest.approx((alone.ci95[0], alone.ci95[1] + 3.0))
+    assert values_of_forms(problem, base, unsure, [])["base"]["offset_um"] == alone
 
 
 def test_what_the_data_do_not_move_is_as_wide_as_its_bounds() -> None:

@@ -105,11 +105,11 @@ def test_a_loop_without_a_lean_is_the_smooth_spring() -> None:
     assert loop_along(course - course[0], 0.3, 0.0, start) == pytest.approx(plain, abs=1e-9)
 
 
-@pytest.mark.parametrize(("flag", "falls"), [(0.0, lambda r: np.exp(-r * r)), (1.0, lambda r: np.exp(-r))])
-def test_the_extra_falls_with_the_square_of_the_speed_or_with_the_speed(
-    flag: float, falls: Callable[[float], float]
-) -> None:
-    """Armstrong-Helouvry (1991), eq. 2.3; Tustin (1947)."""
+@pytest.mark.parametrize(
+    ("flag", "falls"), [(0.0, lambda r: np.exp(-r * r)), (1.0, lambda r: np.exp(-r)), (2.0, lambda r: 1 / (1 + r * r))]
+)
+def test_the_extra_falls_by_one_of_three_laws(flag: float, falls: Callable[[float], float]) -> None:
+    """Armstrong-Helouvry (1991), eq. 2.3; Tustin (1947); Hess and Soom (1990)."""
     row = np.array([1.0, 0.2, 0.5, 0.1, 0.0, 0.0, 0.0, flag])
     for v in (-0.3, -0.1, 0.0, 0.05, 0.2):
         sign = -1.0 if v < 0.0 else 1.0

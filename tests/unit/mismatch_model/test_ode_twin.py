@@ -233,6 +233,45 @@ hold = "zero"
     assert {h.name: h.value for h in model.human(theta)[place.label]}["rising_to_falling"] == pytest.approx(0.6 / 1.4)
 
 
+def test_a_parameter_may_differ_with_the_sign_of_a_velocity(tmp_path: Path) -> None:
+    """A cylinder whose two areas differ: exponentials of the closed form; a turn costs at most half a step of the wrong
+    rate, which is forgotten with the time constant.
+    """
+    cylinder = """
+[twin]
+kind = "ode"
+[twin.states]
+speed = "m/s"
+[twin.equations]
+speed = "(gain * valve - speed) / tau"
+[twin.parameters]
+gain = 2.0
+tau = 0.2
+hold = "zero"
+"""
+    channels = CHANNELS.replace('"command"', '"valve"').replace('"angle"', '"speed"').replace('"rad"', '"m/s"')
+    u = np.repeat(np.array([1.0, 0.2, -0.7, -0.5, 0.6]), 60)
+    recording = recorded(tmp_path, cylinder, u, 0.1 * (u - 0.3), channels)
+    twin = make(recording)
+    here = [p for p in sites(twin, recording, EFFECTS["direction_dependence"]) if p.target == "gain by sign of speed"]
+    pairs = twin.place(here[0].target).pairs  # type: ignore[attr-defined]
+    model = Model(twin, [replace(here[0], settings={"pairs": pairs})])
+    theta = np.append(model.start(recording)[:-1], -0.4)
+    found = model.simulate(View.whole(recording), theta)["speed"]
+    v, allowed = found[0], 1e-9
+    for k in range(1, u.size):
+        allowed *= np.exp(-1 / RATE_HZ / 0.2)
+        left, way = 1 / RATE_HZ, np.sign(v) or np.sign(u[k - 1])
+        goal = 2.0 * (1 - 0.4 * way) * u[k - 1]
+        to_zero = 0.2 * np.log(1 - v / goal) if v * goal < 0 else np.inf
+        if to_zero < left or v == 0.0:
+            allowed += 0.5 / RATE_HZ * 2.0 * 0.8 * abs(u[k - 1]) / 0.2
+        if to_zero < left:
+            left, v, goal = left - to_zero, 0.0, 2.0 * (1 + 0.4 * way) * u[k - 1]
+        v = goal + (v - goal) * np.exp(-left / 0.2)
+        assert found[k] == pytest.approx(v, abs=allowed + 1e-8)
+
+
 def test_a_velocity_differs_with_the_direction_of_its_position(tmp_path: Path) -> None:
     recording, _ = pendulum(tmp_path)
     places = [p.target for p in sites(make(recording), recording, EFFECTS["direction_dependence"])]

@@ -12,9 +12,9 @@ from tools.mismatch.engine.checks import first_look
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.found import human_values, physics_found
+from tools.mismatch.engine.found import physics_found, values_of_forms
 from tools.mismatch.engine.identifiability import LeastNamed, detection
-from tools.mismatch.engine.intervals import Uncertainty, uncertainty
+from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.many import compare_recordings
 from tools.mismatch.engine.one_way import one_way
@@ -27,6 +27,7 @@ from tools.mismatch.engine.report import (
     DependsOn,
     FitSummary,
     Location,
+    ParameterValue,
     PhysicsFound,
     Pictures,
     Report,
@@ -57,10 +58,9 @@ def base_shifts(raw: Fit, base: Fit, fitted: Fit, deviations: Array) -> list[Bas
     return shifts
 
 
-def human_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit, unsure: Uncertainty) -> list[BaseShift]:
+def human_shifts(raw: Fit, base: Fit, found: Mapping[str, ParameterValue]) -> list[BaseShift]:
     """Return ``base_shifts`` under the names and units of the twin's file."""
     given, alone = ({h.name: float(h.value) for h in fit.model.human(fit.theta)["base"]} for fit in (raw, base))
-    found = human_values(problem, fitted, unsure)["base"]
     return [
         BaseShift(name, v.unit, given[name], alone[name], v.value, v.ci95)
         for name, v in found.items()
@@ -82,7 +82,8 @@ def assemble(
     verdict = decision.verdict
     unsure = uncertainty(problem, fitted)
     shifts = base_shifts(raw, base, fitted, unsure.deviations())
-    physics = physics_found(problem, fitted, unsure, sure)
+    values = values_of_forms(problem, fitted, unsure, ended.forms)
+    physics = physics_found(problem, fitted, values, sure)
     exported = without_events(problem, fitted)
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
@@ -171,7 +172,7 @@ def assemble(
             decision.floors,
             dict(rec.tolerance),
             {o: rec.file_unit[o] for o in twin.outputs if rec.file_unit[o] != twin.units[o]},
-            tuple(human_shifts(problem, raw, base, fitted, unsure)),
+            tuple(human_shifts(raw, base, values["base"])),
         ),
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,28 @@ def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str
     return out
 
 
+def values_of_forms(
+    problem: Problem, fitted: Fit, unsure: Uncertainty, forms: Sequence[Fit]
+) -> dict[str, dict[str, ParameterValue]]:
+    """Return the human parameters of ``fitted`` with intervals that are as wide around the values of all ``forms``.
+
+    Data that do not tell two forms of an effect apart leave its parameters uncertain by both (Chatfield, J. R. Stat.
+    Soc. A 158, 1995).
+    """
+    out = human_values(problem, fitted, unsure)
+    for form in forms:
+        for label, group in form.model.human(form.theta).items():
+            here = out.get(label, {})
+            here |= {h.name: _around(here[h.name], h.value) for h in group if h.name in here}
+    return out
+
+
+def _around(p: ParameterValue, other: float) -> ParameterValue:
+    """Return ``p`` with its interval widened to one that is as wide around another value."""
+    lo, hi = p.ci95
+    return replace(p, ci95=(min(lo, other - (p.value - lo)), max(hi, other + (hi - p.value))))
+
+
 def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: Placed) -> str:
     inside = inside_of(problem.twin) if placed.site == "feedback" else None
     if inside is not None:
@@ -83,11 +106,10 @@ def parameters_of(
     }
 
 
-def physics_found(problem: Problem, fitted: Fit, unsure: Uncertainty, sure: Mapping[str, float]) -> list[PhysicsFound]:
-    """Return the effects of a model, parameters from the joint fit. ``sure``: the probability of every name."""
-    if not fitted.model.placed:
-        return []
-    values = human_values(problem, fitted, unsure)
+def physics_found(
+    problem: Problem, fitted: Fit, values: Mapping[str, Mapping[str, ParameterValue]], sure: Mapping[str, float]
+) -> list[PhysicsFound]:
+    """Return the effects of a model; ``values``: its parameters; ``sure``: the probability of every name."""
     rows = problem.held_rows
     out: list[PhysicsFound] = []
     for k, placed in enumerate(fitted.model.placed):

@@ -198,12 +198,14 @@ def pose(recording: Recording, held_out: float, seed: int, effects: Iterable[Eff
 class Ended:
     """Holds a search whose fits run through the whole record.
 
-    ``official`` has the held-out part in one free run if the decisions were made on shorter stretches.
+    ``official`` has the held-out part in one free run if the decisions were made on shorter stretches. ``forms`` has
+    other forms of the same effects that fit as well.
     """
 
     base: Fit
     fitted: Fit
     official: Problem | None = None
+    forms: tuple[Fit, ...] = ()
 
 
 def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> Ended:

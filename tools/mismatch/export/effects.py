@@ -450,10 +450,12 @@ def _friction(s: Slot) -> ForceCode:
     limit = level + (f" + sign * {s.at('asymmetry')}" if has("asymmetry") else "")
     if has("extra"):
         if has("decay_speed"):
-            falls = f"-abs(v) / {s.at('decay_speed')}"
+            fall = f"* np.exp(-abs(v) / {s.at('decay_speed')})"
+        elif has("half_speed"):
+            fall = f"/ (1 + (v / {s.at('half_speed')}) ** 2)"
         else:
-            falls = f"-((v / {s.at('stribeck_speed')}) ** 2)"
-        limit += f" + {s.at('extra')} * np.exp({falls})"
+            fall = f"* np.exp(-((v / {s.at('stribeck_speed')}) ** 2))"
+        limit += f" + {s.at('extra')} {fall}"
     smooth = f" - {s.at('viscous_asymmetry')} * abs(v)" if has("viscous_asymmetry") else ""
     bent = next((n for n in ("presliding", "yield_distance") if has(n)), "")
     return ForceCode(smooth, limit, f"{level} / {s.at(bent)}" if bent else "", s.at("lean") if has("lean") else "")

@@ -12,6 +12,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array
 from sim_devices.physics.flows import PAIRS, flow_pairs, level_names, storages_of
+from sim_devices.physics.parameter import RATE_SIGN
 from tools.errors import InputError
 from tools.guest.equations import (
     ABS,
@@ -199,9 +200,10 @@ class EquationLines:
         turned: set[int] = set()
         for one in inner:
             if one.place.kind == "direction":
-                parameter, state = (int(v) for v in one.slot.placed.settings[PAIRS])
-                turned.add(state)
-                swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('relative_change')} * way_{state}")
+                parameter, state, way = (int(v) for v in one.slot.placed.settings[PAIRS])
+                turned |= {state} if way == RATE_SIGN else set()
+                sign = f"way_{state}" if way == RATE_SIGN else f"np.sign({states[state - 1]})"
+                swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('relative_change')} * {sign}")
         changed = _products(swayed)
         shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
         sub, _ = self.substeps

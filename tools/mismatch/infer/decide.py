@@ -16,10 +16,10 @@ from tools.mismatch.engine.report import Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import LEAST_LEAD, Leftover, Stranger, about, lead, leftover
-from tools.mismatch.infer.borne_out import Out, borne_out, entry_of
+from tools.mismatch.infer.borne_out import Out, borne_out, doubts_of, entry_of
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
-from tools.mismatch.infer.store import Scored, Store
+from tools.mismatch.infer.store import Scored, Store, part_of
 
 MARGIN = 1.05
 """Largest ratio of a rival's held-out residual rms to that of the named set at which the rival fits as well."""
@@ -180,13 +180,7 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
     Equivalence is a paired test on held-out blocks with a margin, which is less for a weak effect (``KEPT``); fewer
     parameters give a rival no advantage.
     """
-    p = store.problem
-    chosen_rms = held_rms(p, chosen.fitted)
-    margins: dict[str, dict[str, float]] = {}
-    for name in sorted(chosen.names):
-        without = held_rms(p, store.without(chosen, lambda e, n=name: e.effect.name == n).fitted)
-        gains = {o: math.log(max(without[o] / max(rms, 1e-300), 1.0)) for o, rms in chosen_rms.items()}
-        margins[name] = {o: min(math.log(MARGIN), KEPT * v) for o, v in gains.items()}
+    margins = _margins(store, chosen)
     out: list[Rival] = []
     for s in store.ranked():
         gone, new = chosen.names - s.names, s.names - chosen.names
@@ -195,15 +189,63 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
         (name,), (instead,) = new, gone
         touched = [o for e in s.placed if e.effect.name == name for o in e.outputs]
         touched += [o for e in chosen.placed if e.effect.name == instead for o in e.outputs]
-        rival_rms = held_rms(p, s.fitted)
-        output = max(dict.fromkeys(touched), key=lambda o: rival_rms[o] / max(chosen_rms[o], 1e-300))
-        ratio = rival_rms[output] / max(chosen_rms[output], 1e-300)
-        worse = (chosen.blocks - s.blocks).sum(axis=1)
-        spread = float(np.std(worse, ddof=1) / math.sqrt(worse.size)) if worse.size > 1 else math.inf
-        margin = margins[instead]
-        within = float(np.mean(worse)) + 1.645 * spread < sum(margin[o] for o in set(touched))
-        out.append(Rival(s, name, instead, output, ratio, within and math.log(max(ratio, 1e-300)) <= margin[output]))
+        out.append(Rival(s, name, instead, *_against(store.problem, chosen, s, touched, margins[instead])))
     return tuple(out[:8])
+
+
+def _margins(store: Store, chosen: Scored) -> dict[str, dict[str, float]]:
+    """Return per name and output the log ratio of residuals up to which another account fits as well."""
+    p = store.problem
+    chosen_rms = held_rms(p, chosen.fitted)
+    margins: dict[str, dict[str, float]] = {}
+    for name in sorted(chosen.names):
+        without = held_rms(p, store.without(chosen, lambda e, n=name: e.effect.name == n).fitted)
+        gains = {o: math.log(max(without[o] / max(rms, 1e-300), 1.0)) for o, rms in chosen_rms.items()}
+        margins[name] = {o: min(math.log(MARGIN), KEPT * v) for o, v in gains.items()}
+    return margins
+
+
+def _against(
+    p: Problem, chosen: Scored, s: Scored, touched: Sequence[str], margin: Mapping[str, float]
+) -> tuple[str, float, bool]:
+    """Return the output on which ``s`` loses most to ``chosen``, the ratio of the residuals there, and True if a paired
+    test finds ``s`` no worse than the margin."""
+    own, other = held_rms(p, chosen.fitted), held_rms(p, s.fitted)
+    output = max(dict.fromkeys(touched), key=lambda o: other[o] / max(own[o], 1e-300))
+    ratio = other[output] / max(own[output], 1e-300)
+    worse = (chosen.blocks - s.blocks).sum(axis=1)
+    spread = float(np.std(worse, ddof=1) / math.sqrt(worse.size)) if worse.size > 1 else math.inf
+    within = float(np.mean(worse)) + 1.645 * spread < sum(margin[o] for o in set(touched))
+    return output, ratio, within and math.log(max(ratio, 1e-300)) <= margin[output]
+
+
+FORMS = 3
+"""Number of other forms of the named effects whose parameters widen the intervals."""
+
+
+def forms_as_good(store: Store, chosen: Scored) -> tuple[Fit, ...]:
+    """Return the fits of other forms of the effects of ``chosen`` at their places that fit as well, best first.
+
+    A form that would not be named itself, because a size that it needs may be zero, is none of them.
+    """
+    where = sorted((e.effect.name, e.site, e.target) for e in chosen.placed)
+    alike = [
+        s
+        for s in store.sets.values()
+        if s.proper and s.key != chosen.key and sorted((e.effect.name, e.site, e.target) for e in s.placed) == where
+    ]
+    if not where or not alike:
+        return ()
+    margins, own = _margins(store, chosen), {part_of(e) for e in chosen.placed}
+    good: list[Scored] = []
+    for s in sorted(alike, key=store.score, reverse=True):
+        other = [e for e in s.placed if part_of(e) not in own]
+        touched = [o for e in other for o in e.outputs]
+        margin = {o: min(margins[e.effect.name][o] for e in other) for o in store.problem.twin.outputs}
+        if _against(store.problem, chosen, s, touched, margin)[2]:
+            good.append(s)
+    refined = (store.refined(s).fitted for s in good[:FORMS])
+    return tuple(f for f in refined if not doubts_of(store.problem, f))
 
 
 def candidate_signals(first: Sequence[Trial]) -> frozenset[str]:

@@ -22,7 +22,15 @@ from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.borne_out import doubts_of
 from tools.mismatch.infer.constants import Constants, learned
-from tools.mismatch.infer.decide import LIKELY, Answer, decide, log_odds, recalibrated, without_doubted
+from tools.mismatch.infer.decide import (
+    LIKELY,
+    Answer,
+    decide,
+    forms_as_good,
+    log_odds,
+    recalibrated,
+    without_doubted,
+)
 from tools.mismatch.infer.holds import better_holds
 from tools.mismatch.infer.pooled import pool
 from tools.mismatch.infer.sealed import score_sealed, seal
@@ -118,7 +126,7 @@ def _through(posed: Posed, store: Store, answer: Answer, held_out: float) -> tup
         ended = run_through(posed, store.base.fitted, chosen.fitted, held_out)
         doubts = doubts_of(posed.problem, ended.fitted) if ended.fitted is not chosen.fitted else []
         if not doubts:
-            return answer, decision, chosen, ended
+            return answer, decision, chosen, replace(ended, forms=forms_as_good(store, chosen) if named else ())
         # one at a time: without the weakest of two that stand for each other, the other may be certain
         weakest = min(doubts, key=lambda d: effect_size(store, chosen, chosen.placed[d.k].effect.name))
         answer = without_doubted(store, answer, ended.fitted, weakest)

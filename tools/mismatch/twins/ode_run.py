@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, flow_of, friction_limit, smooth_force
+from sim_devices.physics.parameter import RATE_SIGN
 from tools.mismatch.twins.program import run_program
 
 SWAY = 5
-"""Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and 1 if it
-follows the sign of that state's derivative (at the constant parameters) in place of the value."""
+"""Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and in place
+of the value the sign of that state's derivative at the constant parameters (1) or of the state itself (2)."""
 
 STEEP = 0.25
 """Fall of friction with speed, times a step, above which the step is taken in parts."""
@@ -107,7 +108,7 @@ def run_equations(program, drive, packed, x0, limits):
     registers = registers0.copy()
     first, way = np.zeros(max(sway.shape[0], 1)), np.zeros(max(sway.shape[0], 1))
     no_cogging, no_friction = np.zeros(COGGING), np.zeros(FRICTION)
-    turns = np.any(sway[:, 4] != 0.0)
+    turns = np.any(sway[:, 4] == RATE_SIGN)
     # at the begin of a step, where the derivative is asked for, at the end of the step
     x, y, z = np.zeros(s), np.zeros(s), np.zeros(s)
     rates = np.zeros((5, s))  # derivatives of the four stages, and the one that decides between slip and rest
@@ -195,12 +196,15 @@ def run_equations(program, drive, packed, x0, limits):
                             for c in range(sway.shape[0]):
                                 r = int(sway[c, 0])
                                 first[c] = registers[r]
-                                value = way[c] if sway[c, 4] != 0.0 else registers[int(sway[c, 1])]
+                                value = registers[int(sway[c, 1])]
+                                if sway[c, 4] != 0.0:
+                                    value = way[c] if sway[c, 4] == RATE_SIGN else np.sign(value)
                                 registers[r] *= 1.0 + sway[c, 2] * (value - sway[c, 3])
                         run_program(operations, registers)
                         if last == 0:
                             for c in range(sway.shape[0]):
-                                way[c] = np.sign(registers[results[int(sway[c, 1]) - 1]]) if sway[c, 4] != 0.0 else 0.0
+                                if sway[c, 4] == RATE_SIGN:
+                                    way[c] = np.sign(registers[results[int(sway[c, 1]) - 1]])
                     for c in range(sway.shape[0] - 1, -1, -1):
                         registers[int(sway[c, 0])] = first[c]
                     for i in range(s):

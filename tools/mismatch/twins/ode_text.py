@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
+from sim_devices.physics.parameter import OWN_SIGN, RATE_SIGN
 from tools.errors import RecordingError
 from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
@@ -121,9 +122,9 @@ def _assembled(
     places = (*places, *_parameters(recording, states, signals, names, changing))
     if recording.twin.kind == "ode":
         first = 1 + len(states) + len(signals)
-        for i, j in _directions(equations, places, x, u, values, changing):
-            name = f"{names[i]} by direction of {states[j].name}"
-            places = (*places, Place(name, "direction", j, j, 0, states[j].unit, (float(first + i), 1.0 + j)))
+        for i, j, way in _directions(equations, places, x, u, values, changing):
+            name = f"{names[i]} by {'sign' if way == OWN_SIGN else 'direction'} of {states[j].name}"
+            places = (*places, Place(name, "direction", j, j, 0, states[j].unit, (float(first + i), 1.0 + j, way)))
     units_of = {**own_units, **{n: recording.unit[o] for n, o in offset_of.items()}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
@@ -286,11 +287,12 @@ def _parameters(
 
 def _directions(
     equations: Equations, places: Sequence[Place], x: Array, u: Array, values: Array, free: Sequence[int]
-) -> list[tuple[int, int]]:
-    """Return (parameter, state): each parameter of a derivative, with the state whose direction it may differ with.
+) -> list[tuple[int, int, float]]:
+    """Return (parameter, state, way): each parameter of a derivative, with a state whose direction it may follow.
 
     That is the state itself, or of a velocity its position. A position may have a parameter of its own: the gain of a
-    valve, where its opening counts as the velocity.
+    valve, where its opening counts as the velocity. A velocity without a position has a direction of its own where its
+    sign changes.
     """
     at = np.linspace(0, x.shape[0] - 1, PROBES).astype(int)
     as_given = rates_at(equations, x[at], u[at], values)
@@ -298,12 +300,15 @@ def _directions(
     follows = {**{j: [j] for j in range(x.shape[1])}, **{p.target: list[int]() for p in acted_on}}
     for p in acted_on:
         follows[p.target].append(p.position)
-    out: list[tuple[int, int]] = []
+    turning = {p.target for p in acted_on if p.kind == "motion" and p.position == p.velocity}
+    turning = {j for j in turning if np.min(x[:, j]) < 0.0 < np.max(x[:, j])}
+    out: list[tuple[int, int, float]] = []
     for i in free:
         changed = values.copy()
         changed[i] = values[i] * 1.01 if values[i] else 1e-3
         differs = np.any(rates_at(equations, x[at], u[at], changed) != as_given, axis=0)
-        out += [(i, j) for j in dict.fromkeys(j for k, of in follows.items() if differs[k] for j in of)]
+        out += [(i, j, RATE_SIGN) for j in dict.fromkeys(j for k, of in follows.items() if differs[k] for j in of)]
+        out += [(i, j, OWN_SIGN) for j in sorted(turning) if differs[j]]
     return out
 
 

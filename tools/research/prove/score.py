@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tools.mismatch.units import same_dimension
 from tools.research.prove.disk import contract_unit
 
 FALSE_ALARM = ("missing_physics", "unexplained")
 TO_SI = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "Hz": 1.0, "kHz": 1e3, "1": 1.0, "": 1.0, "%": 1e-2, "ppm": 1e-6, "V": 1.0,
     "mV": 1e-3, "um": 1e-6, "mm": 1e-3, "m": 1.0, "N": 1.0, "g": 9.80665, "mg": 9.80665e-3, "m/s^2": 1.0, "uT": 1e-6,
-    "samples": math.nan,
 }  # fmt: skip
 # what a report may call a figure of the answer
 SAME = {
@@ -91,6 +91,8 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any], *, far_off: b
     """Return which figures of the answer were reported, and whether their 95 % interval holds the true value.
 
     ``far_off``: figures that are more than ten times off count, too, and a figure without an interval does not hold.
+    A figure of another dimension is no figure of the answer: a gap at an output in um, where the true one is in volts
+    of the input.
     """
     rows: list[dict[str, Any]] = []
     for truth in answer["effects"]:
@@ -105,7 +107,8 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any], *, far_off: b
                     same = False
                 par_unit = str(par.get("unit", ""))
                 ci = par.get("ci95")
-                if not same or par_unit not in TO_SI or home not in TO_SI:
+                known = par_unit in TO_SI and home in TO_SI and same_dimension(par_unit or "1", home or "1")
+                if not same or not known:
                     continue
                 k = TO_SI[par_unit] / TO_SI[home]
                 if not ci or None in ci:
