@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from tools.calibrate.multi_position import Estimate, missing_poses
+from tools.calibrate.multi_position import Estimate, estimates_of, missing_poses
 from tools.errors import InputError
 from tools.numbers import rms
 
@@ -166,7 +166,4 @@ def _intervals(x: Array, jacobian: Array, residual: Array, free: list[int]) -> t
     spread = np.zeros(9)
     spread[free] = np.sqrt(np.diag(sigma2 * np.linalg.pinv(jacobian.T @ jacobian)))
     reach = float(student.ppf(0.975, freedom)) * spread
-    return {
-        name: Estimate(float(v), float(v - r), float(v + r))
-        for name, v, r in zip((*NAMES, DRIFT), x, reach, strict=True)
-    }, condition
+    return estimates_of((*NAMES, DRIFT), x, reach), condition

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from tools.calibrate.multi_position import Estimate, missing_poses
+from tools.calibrate.multi_position import Estimate, estimates_of, missing_poses
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ def fit_ellipsoid(raw: Array) -> Ellipsoid:
     return Ellipsoid(
         matrix,
         bias,
-        {n: Estimate(float(v), float(v - r), float(v + r)) for n, v, r in zip(names, values, reach, strict=True)},
+        estimates_of(names, values, reach),
         float(norm.mean()),
         float(norm.std()),
         float(norm[inside].std()),

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from tools.calibrate.multi_position import Estimate
+from tools.calibrate.multi_position import Estimate, estimates_of
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -67,12 +67,8 @@ def fit_turn(field: Array, force: Array) -> BodyTurn:
     values = np.degrees(fit.x[:3])
     dip = float(np.degrees(np.arcsin(np.clip(-fit.x[3], -1.0, 1.0))))
     slant = max(1e-3, float(np.sqrt(max(0.0, 1.0 - fit.x[3] ** 2))))
-    estimates = {
-        f"turn_{axis}_deg": Estimate(float(v), float(v - r), float(v + r))
-        for axis, v, r in zip("xyz", values, np.degrees(reach[:3]), strict=True)
-    }
-    wide = float(np.degrees(reach[3] / slant))
-    estimates["dip_deg"] = Estimate(dip, dip - wide, dip + wide)
+    estimates = estimates_of(("turn_x_deg", "turn_y_deg", "turn_z_deg"), values, np.degrees(reach[:3]))
+    estimates["dip_deg"] = Estimate.around(dip, float(np.degrees(reach[3] / slant)))
     return BodyTurn(Rotation.from_rotvec(fit.x[:3]).as_matrix(), estimates, scale, condition, len(left))
 
 
@@ -88,5 +84,5 @@ def strap(set_raw: Array, reset_raw: Array) -> tuple[Array, tuple[Estimate, ...]
     sums = 0.5 * (set_raw + reset_raw)
     mean, error = sums.mean(axis=0), sums.std(axis=0, ddof=1) / np.sqrt(len(sums))
     reach = float(student.ppf(0.975, len(sums) - 1)) * error
-    offset = tuple(Estimate(float(m), float(m - r), float(m + r)) for m, r in zip(mean, reach, strict=True))
+    offset = tuple(map(Estimate.around, mean, reach))
     return 0.5 * (set_raw - reset_raw), offset

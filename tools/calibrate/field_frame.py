@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from tools.calibrate.field_axes import strap
 from tools.calibrate.multi_position import Estimate
 
 Array = NDArray[np.float64]
@@ -33,21 +34,14 @@ class FieldFrame:
     offset_V: tuple[Estimate, ...] | None
 
 
-def _mean(values: Array) -> Estimate:
-    reach = float(student.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / len(values) ** 0.5
-    centre = float(values.mean())
-    return Estimate(centre, centre - reach, centre + reach)
-
-
 def fit_field(attitude: Array, set_V: Array, reset_V: Array | None = None) -> FieldFrame:
     """Fit bias and matrix from ``attitude`` (n, 3, 3), body to world, and outputs (n, 3) in V after set and reset
     pulses."""
     offset = None
     volts = set_V
     if reset_V is not None:
-        sums = 0.5 * (set_V + reset_V)
-        offset = tuple(_mean(sums[:, i]) for i in range(3))
-        volts = 0.5 * (set_V - reset_V) + np.array([e.value for e in offset])
+        turning, offset = strap(set_V, reset_V)
+        volts = turning + np.array([e.value for e in offset])
     n = len(attitude)
     matrix, bias, field = NOMINAL_V_PER_UT * np.eye(3), volts.mean(axis=0), np.zeros(3)
     turned = attitude.transpose(0, 2, 1)
@@ -68,7 +62,7 @@ def fit_field(attitude: Array, set_V: Array, reset_V: Array | None = None) -> Fi
     factor = float(student.ppf(0.975, freedom)) * np.sqrt(np.sum(residual**2, axis=0) / freedom)
     reach = factor[:, None] * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
     return FieldFrame(
-        tuple(Estimate(float(b), float(b - r), float(b + r)) for b, r in zip(bias, reach[:, 0], strict=True)),
+        tuple(map(Estimate.around, bias, reach[:, 0])),
         matrix,
         reach[:, 1:],
         field,

@@ -16,7 +16,7 @@ from scipy.stats import t as student
 
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
-from tools.calibrate.multi_position import Estimate, MultiPosition, compensate, identify_poses
+from tools.calibrate.multi_position import Estimate, MultiPosition, compensate, estimates_of, identify_poses
 from tools.calibrate.still import find_poses
 from tools.errors import InputError
 
@@ -147,15 +147,11 @@ def fit_gyroscope(
     freedom = max(1, 2 * len(start) - 9)  # a direction has two angles
     sigma2 = float(fit.fun @ fit.fun) / freedom
     reach = float(student.ppf(0.975, freedom)) * unit * np.sqrt(np.diag(sigma2 * np.linalg.pinv(fit.jac.T @ fit.jac)))
-    estimates = {
-        name: Estimate(float(v), float(v - r), float(v + r))
-        for name, v, r in zip(NAMES, fit.x * unit, reach, strict=True)
-    }
+    estimates = estimates_of(NAMES, fit.x * unit, reach)
     weight = poses.samples / poses.samples.sum()
     mean = weight @ rest
     spread = float(student.ppf(0.975, len(rest) - 1)) * np.sqrt(weight @ (rest - mean) ** 2 / (len(rest) - 1))
-    for axis, b, r in zip("xyz", mean, spread, strict=True):
-        estimates[f"bias_{axis}"] = Estimate(float(b), float(b - r), float(b + r))
+    estimates |= estimates_of(("bias_x", "bias_y", "bias_z"), mean, spread)
     angle = float(np.sqrt(np.mean(np.sum(fit.fun.reshape(-1, 3) ** 2, axis=1))))
     return GyroscopeFit(estimates, angle, condition, len(start), saturated, accelerometer)
 

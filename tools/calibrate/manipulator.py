@@ -21,7 +21,7 @@ from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.manipulator import star_tip
 from hal.npz import open_npz
 from tools.calibrate.calibration_file import calibration_toml
-from tools.calibrate.multi_position import Estimate
+from tools.calibrate.multi_position import Estimate, estimates_of
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -123,9 +123,7 @@ def identify_manipulator(data: dict[str, Array]) -> ManipulatorFit:
     before, after = residuals(p0).reshape(-1, 3), residuals(p).reshape(-1, 3)
     return ManipulatorFit(
         table=_table(p),
-        parameters={
-            name: Estimate(float(v), float(v - w), float(v + w)) for name, v, w in zip(NAMES, p, width, strict=True)
-        },
+        parameters=estimates_of(NAMES, p, width),
         residual_um=_rms(after),
         before_um=_rms(before),
         condition=condition,

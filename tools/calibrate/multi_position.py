@@ -7,6 +7,7 @@ hold them.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,16 @@ class Estimate:
     value: float
     low: float
     high: float
+
+    @classmethod
+    def around(cls, value: float, reach: float) -> Estimate:
+        """Return ``value`` with an interval that reaches equally far to both sides."""
+        return cls(float(value), float(value - reach), float(value + reach))
+
+
+def estimates_of(names: Iterable[str], values: Array, reach: Array) -> dict[str, Estimate]:
+    """Return the estimate of each name, from values and reaches in the order of ``names``."""
+    return {name: Estimate.around(v, r) for name, v, r in zip(names, values, reach, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -113,10 +124,7 @@ def fit_poses(
             f"allowed): turn the sensor over; no pose within 35 degrees of {', '.join(missing) or 'nothing'}"
         )
     return MultiPosition(
-        {
-            name: Estimate(float(v), float(v - r), float(v + r))
-            for name, v, r in zip(NAMES, values, reach95, strict=True)
-        },
+        estimates_of(NAMES, values, reach95),
         float(magnitude.mean()),
         float(np.sqrt(np.mean((magnitude - gravity) ** 2))),
         condition,

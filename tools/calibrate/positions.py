@@ -64,7 +64,7 @@ class PositionFit:
     def parameters(self) -> dict[str, Estimate]:
         """Return the coordinates ``1_x`` ... in m."""
         return {
-            f"{name}_{axis}": Estimate(float(v), float(v - r), float(v + r))
+            f"{name}_{axis}": Estimate.around(v, r)
             for name, place, reach in zip(self.names, self.places, self.reach, strict=True)
             for axis, v, r in zip("xyz", place, reach, strict=True)
         }

@@ -126,8 +126,7 @@ def _one_pose(values: Array) -> dict[str, Estimate]:
         reach = 2.131 * float(blocks.std(ddof=1)) / 4.0  # Student, 15 degrees of freedom
         if values[:, i].std() < 0.5 * step:
             reach = max(reach, UNDITHERED_STEPS * step)
-        centre = float(values[:, i].mean())
-        estimates[f"bias_{axis}"] = Estimate(centre, centre - reach, centre + reach)
+        estimates[f"bias_{axis}"] = Estimate.around(values[:, i].mean(), reach)
     return estimates
 
 
@@ -183,7 +182,7 @@ def turn(raw: Array) -> QuickResult:
         # the scatter itself, not that of a mean: an extreme is passed and not held, and its flank reads less
         error = max(wide * float(scatter[i]) / 2.0, UNDITHERED_STEPS * step)
         for name, value in ((f"bias_{'xyz'[i]}", float(bias[i])), (f"scale_{'xyz'[i]}", float(scale[i]))):
-            parameters[name] = Estimate(value, value - error, value + error)
+            parameters[name] = Estimate.around(value, error)
     rest = np.ones(len(raw), dtype=bool)
     rest[np.concatenate([low, high])[:, axes].ravel()] = False
     size = np.linalg.norm((raw[rest][:, axes] - bias[axes]) / scale[axes], axis=1)

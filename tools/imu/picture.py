@@ -15,7 +15,6 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73")
 
 def save_imu_picture(series: Series, path: Path) -> None:
     """Write a PNG; the folder is made if it is not there. Means are taken off, long series are thinned by envelope."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     warm = series.temperature_C if series.temperature_C is not None and np.ptp(series.temperature_C) >= 5.0 else None
@@ -23,7 +22,6 @@ def save_imu_picture(series: Series, path: Path) -> None:
     if series.gyro_dps is not None:
         kinds.append(("rate - mean (deg/s)", series.gyro_dps))
     figure = Figure(figsize=(9.0, 3.0 * len(kinds)), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(kinds), 1 if warm is None else 2, squeeze=False)
     for row, (label, data) in enumerate(kinds):
         centred = data - data.mean(axis=0)

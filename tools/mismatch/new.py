@@ -240,12 +240,10 @@ def _save(path: Path, columns: dict[str, Array]) -> None:
 
 def _draw(found: Guess, title: str, path: Path) -> None:
     """Draw a strip per column: the smallest and largest value of each part of the file."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     drawn = [c for c in found.columns if c.name != found.clock] or found.columns
     figure = Figure(figsize=(9.0, 1.0 + 1.2 * len(drawn)), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(drawn), 1, squeeze=False, sharex=True)[:, 0]
     for ax, column in zip(axes, drawn, strict=True):
         x = (np.arange(len(column.low)) + 0.5) / len(column.low) * found.samples

@@ -13,11 +13,9 @@ from tools.output import save_figure
 
 def save_allan_picture(curves: Mapping[str, tuple[AllanCurve, NoiseModel]], path: Path) -> None:
     """Write a PNG; the folder is made if it is not there."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 5.0), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for name, (curve, model) in curves.items():
         reach = np.abs(np.stack([curve.low, curve.high]) - curve.deviation)

@@ -24,7 +24,6 @@ def test_scene_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     config, n = EmulationConfig(unit=1, seed=1), 25
     rng = np.random.default_rng(3)
     noise, slow = rng.standard_normal((n, NOISES)), rng.standard_normal((n, SLOW_NOISES))
-    magnet = rng.standard_normal((n, 3))
     results = []
     for compiled in (True, False):
         hand = SyntheticHand(config.hand, 1)
@@ -43,7 +42,7 @@ def test_scene_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
                         if isinstance(value, Dispatcher):
                             monkeypatch.setattr(module, key, value.py_func)
             records = tuple(attributes(r) for r in records)
-        scene.scene_kernel(plant, state, nodes, noise, slow, magnet, 0, *records, frame, out)
+        scene.scene_kernel(plant, state, nodes, noise, slow, 0, *records, frame, out)
         results.append((out, frame))
     np.testing.assert_allclose(results[1][0], results[0][0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(results[1][1], results[0][1], rtol=1e-9, atol=1e-12)

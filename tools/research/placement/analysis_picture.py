@@ -13,11 +13,9 @@ from tools.research.placement.analysis import BAND_HZ, Analysis
 
 def save_analysis_picture(found: Sequence[Analysis], path: Path) -> None:
     """Write a PNG; the folder is made if it is not there."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.6), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(1, 3)
     rows = (
         ("acceleration of the tip (mm/s$^2$)", [1e3 * a.force_tip for a in found]),

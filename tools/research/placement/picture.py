@@ -11,12 +11,10 @@ from tools.research.placement.space import Space
 
 def save_placement_picture(placement: Placement, space: Space, path: Path) -> None:
     """Write a PNG; the folder is made if it is not there."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
     figure = Figure(figsize=(10.0, 4.5), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     side, back = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
     for axes, (a, b), labels in (
         (side, (2, 0), ("z, toward the tip (mm)", "x (mm)")),

@@ -7,7 +7,6 @@ instrument's own code: sensors, room, supply, hand.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ from firmware_py.sensing.stage import Sensing, sense_kernel
 from hal.compiled import kernel
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import NODE_S, Hand
-from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin, copy, outputs
+from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin, outputs
 from sim_devices.plant.lab_motion import sense_at
 from sim_devices.plant.rigid_body import quaternion
 from sim_devices.plant.sensors import sensor_unit
@@ -55,17 +54,11 @@ _RATE = LAYOUT.start("rate")
 
 
 @kernel
-def scene_kernel(plant, state, nodes, noise, slow, magnet_uT, first, sense_state, sense_params, frame, out):
-    """``out`` (n, OUT) from hand nodes (n, 18), noise (n, NOISES), slow (n, SLOW_NOISES).
-
-    ``magnet_uT`` (n, 3), body axes, is added to the field.
-    """
+def scene_kernel(plant, state, nodes, noise, slow, first, sense_state, sense_params, frame, out):
+    """``out`` (n, OUT) from hand nodes (n, 18), noise (n, NOISES), slow (n, SLOW_NOISES)."""
     p, s = plant[0], state[0]
-    iron = p["hard_iron_G"].copy()
     for k in range(nodes.shape[0]):
         sense_at(p, s, nodes[k], noise[k], slow[k])
-        for i in range(3):
-            p["hard_iron_G"][i] = iron[i] + 0.01 * magnet_uT[k, i]
         outputs(p, s, 0.0)
         frame[TICK] = first + k
         frame[STATUS] = 0.0
@@ -92,7 +85,6 @@ def scene_kernel(plant, state, nodes, noise, slow, magnet_uT, first, sense_state
         for i in range(6):
             row[29 + i] = frame[_AXES + i]
         row[35] = frame[STATUS]
-    copy(iron, p["hard_iron_G"])
 
 
 @dataclass(frozen=True)
@@ -107,19 +99,9 @@ class SceneResult:
 
 
 def run_scene(
-    config: EmulationConfig,
-    sensing: SensingConfig,
-    hand: Hand,
-    seconds: float,
-    *,
-    every: int = 1,
-    magnet_uT: Callable[[Array], Array] | None = None,
-    progress: Callable[[float], None] | None = None,
+    config: EmulationConfig, sensing: SensingConfig, hand: Hand, seconds: float, *, every: int = 1
 ) -> SceneResult:
-    """Run unit ``config.unit`` with noise ``config.seed`` and keep every ``every``-th millisecond.
-
-    ``magnet_uT`` gives a field (n, 3), body axes, from times (n,) s. ``progress`` hears of the seconds done.
-    """
+    """Run unit ``config.unit`` with noise ``config.seed`` and keep every ``every``-th millisecond."""
     unit = build_unit(config, config.unit)
     plant, state = plant_arrays(config, unit, hand.frame)
     plant[0]["accelerometer"] = sensor_unit(config.sensors, config.instrument, config.unit, NODE_S).accelerometers
@@ -131,22 +113,15 @@ def run_scene(
     total = round(seconds / NODE_S)
     kept = np.empty((-(-total // every), OUT))
     out, parts = np.empty((BLOCK, OUT)), np.zeros((BLOCK, 6))
-    no_magnet = np.zeros((BLOCK, 3))
     for first in range(0, total, BLOCK):
         n = min(BLOCK, total - first)
         hand.fill(nodes[:n], parts[:n])
         noise, slow = rng.standard_normal((n, NOISES)), rng.standard_normal((n, SLOW_NOISES))
-        t_s: Array = np.arange(first, first + n, dtype=np.float64) * NODE_S
-        magnet = no_magnet[:n] if magnet_uT is None else np.ascontiguousarray(magnet_uT(t_s))
-        scene_kernel(
-            plant, state, nodes[:n], noise, slow, magnet, first, firmware.state, firmware.params, frame, out[:n]
-        )
+        scene_kernel(plant, state, nodes[:n], noise, slow, first, firmware.state, firmware.params, frame, out[:n])
         skip = -first % every
         rows = out[skip:n:every]
         at = (first + skip) // every
         kept[at : at + len(rows)] = rows
-        if progress is not None:
-            progress((first + n) * NODE_S)
     columns, at = {}, 0
     for name, width in COLUMNS:
         columns[name] = kept[:, at : at + width]

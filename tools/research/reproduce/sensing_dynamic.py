@@ -22,35 +22,13 @@ from tools.research.placement.configurations import Placement
 from tools.research.placement.variance import motion_covariance
 from tools.research.reproduce.rows import Row
 from tools.research.reproduce.scene import SceneResult, run_scene
-from tools.research.reproduce.sensing_static import UNITS, Calibrated, calibrated
+from tools.research.reproduce.sensing_static import UNITS, calibrated
+from tools.research.tremor.ideal import PERFECT_EMULATION
 
 Array = NDArray[np.float64]
 RATE_HZ = 1000.0
 IDEAL = SensorConfig(
-    rc_spread=0.0,
-    bias_spread_V=0.0,
-    scale_spread=0.0,
-    misalignment_deg=0.0,
-    cross_quadratic_V_per_g2=0.0,
-    cross_linear_V_per_g=0.0,
-    scale_variation_per_g=0.0,
-    cross_fold_V=0.0,
-    cross_product_V_per_g2=0.0,
-    spring_per_g2=0.0,
-    bias_temperature_mg_per_K=0.0,
-    scale_temperature_per_K=0.0,
-    supply_spread=0.0,
-    supply_wander_mV=0.0,
-    divider_spread=0.0,
-    temperature_offset_K=0.0,
-    magnetometer_offset_V=0.0,
-    magnetometer_scale_spread=0.0,
-    magnetometer_misalignment_deg=0.0,
-    hard_iron_mG=0.0,
-    soft_iron=0.0,
-    piezo_coupling_G_per_A=0.0,
-    daq_offset_uV=0.0,
-    daq_gain_spread=0.0,
+    **{k: v for k, v in PERFECT_EMULATION["sensors"].items() if k not in ("daq_noise_uV", "magnetometer_noise_uG")}
 )
 """Noise of the data sheets and nothing else."""
 
@@ -140,10 +118,10 @@ def translation_rows() -> list[Row]:
     ]
 
 
-def arm_rows(both: Calibrated | None = None) -> list[Row]:
+def arm_rows() -> list[Row]:
     """Latt 2011 Fig. 16: the arm shaken by hand at 1 to 5 Hz about the body's x axis, (49) against the arm's own
     motion."""
-    both = both or calibrated(False, 1)
+    both = calibrated(False, 1)
     t = np.arange(22_000) / RATE_HZ
     swing = sum(
         a * np.sin(2.0 * np.pi * f * t + p) for a, f, p in ((0.03, 1.6, 0.0), (0.02, 2.7, 1.0), (0.01, 4.1, 2.0))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.tremor.config import Method, TremorConfig
+from tools.output import save_figure
 from tools.research.tremor.cases import RATE_HZ, Case
 from tools.research.tremor.evaluate import LIMITS, ORACLE, OTHERS, UNSEEN, Summary, run_case, with_horizon
 from tools.research.tremor.scores import residual
@@ -18,12 +19,10 @@ SHOWN_S = 8.0  # from the start: how a method learns is part of it
 
 def save_horizon_picture(lines: Sequence[Summary], path: Path) -> None:
     """Write a PNG, one panel a group; the folder is made if it is not there."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     groups = list(dict.fromkeys(line.group for line in lines))
     figure = Figure(figsize=(5.0 * len(groups), 4.2), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     for n, group in enumerate(groups):
         axes = figure.add_subplot(1, len(groups), n + 1)
         for method in dict.fromkeys(line.method for line in lines if line.group == group):
@@ -41,17 +40,14 @@ def save_horizon_picture(lines: Sequence[Summary], path: Path) -> None:
         axes.set(title=group, xlabel="horizon (ms)", ylabel="left of the motion (% rms)", ylim=(0, 120))
         axes.grid(visible=True, lw=0.3)
         axes.legend(fontsize="x-small")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def save_series_picture(case: Case, methods: Sequence[Method], horizon_ms: int, path: Path) -> None:
     """Write a PNG: the axis that moves most, above the motion, below what each method leaves of it."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 1.6 * (1 + len(methods))), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     ticks = round(horizon_ms * 1e-3 * RATE_HZ)
     rows = slice(0, round(SHOWN_S * RATE_HZ))
     axis = int(np.argmax(np.var(case.truth, axis=0)))
@@ -73,5 +69,4 @@ def save_series_picture(case: Case, methods: Sequence[Method], horizon_ms: int, 
             axes.tick_params(labelbottom=False)
         else:
             axes.set_xlabel("time (s)")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)

@@ -17,7 +17,6 @@ SHOWN_HZ = 20.0
 
 def inspection_figure(found: Inspection) -> Any:
     """A matplotlib figure: above the spectrogram in dB with each window's peak, below the mean spectrum."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     signal, rule = found.signal, found.rule
@@ -27,7 +26,6 @@ def inspection_figure(found: Inspection) -> Any:
     level_dB = 10.0 * np.log10(np.maximum(np.array([s.density[in_range] for s in spectra]).T, 1e-300))
     top = float(np.percentile(level_dB, 99.8))
     figure = Figure(figsize=(9.0, 6.5), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, height_ratios=(2, 1))
     span = (signal.start_s, signal.start_s + signal.seconds, 0.0, float(spectra[0].frequency_hz[in_range][-1]))
     image = upper.imshow(level_dB, origin="lower", aspect="auto", extent=span, cmap="magma", vmin=top - 60.0, vmax=top)
