@@ -7,6 +7,7 @@ Rich reads ``[running]`` or ``[firmware]`` as a style and leaves it out. Style i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console, RenderableType
@@ -47,6 +48,14 @@ def table_of(title: str | None, *headings: str, left: int = 1, no_wrap: bool = F
         for i, heading in enumerate(headings)
     )
     return Table(*columns, title=title, title_justify="left", **options)
+
+
+def pairs_of(rows: Iterable[tuple[str, str | Text]]) -> Table:
+    """Return names, dim, beside what belongs to each; text that is too long is folded."""
+    grid = Table.grid(Column(style="dim", no_wrap=True), Column(overflow="fold"), padding=(0, 2, 0, 0))
+    for name, value in rows:
+        grid.add_row(name, Text(value) if isinstance(value, str) else value)
+    return grid
 
 
 def progress_bar(console: Console, *columns: ProgressColumn) -> Progress:

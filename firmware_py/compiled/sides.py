@@ -30,7 +30,11 @@ LONGEST_FRAME = 72
 
 
 class Side(Protocol):
-    """Stands for the Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes."""
+    """Stands for the Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes.
+
+    ``begin``, ``take_over``, ``catch_up``, ``feed``, ``flush`` and ``close`` do nothing where an output does not define
+    them.
+    """
 
     def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
         """Return what ``firmware_py.compiled.outputs`` works on. ``fixed_ns`` (1,): the time in virtual time."""
@@ -48,23 +52,25 @@ class Side(Protocol):
     def fileno(self) -> int: ...
     def begin(self) -> None:
         """Pass over what has come for the thread while Python was at work."""
-        ...
 
     def take_over(self, is_read_back: bool) -> None:
         """Hand to the driver what the thread has left to it. ``is_read_back``: it came from reading back."""
-        ...
 
     def catch_up(self) -> None:
         """Let the driver pass over what has come for it while the thread was at work."""
-        ...
 
-    def feed(self) -> None: ...
-    def flush(self) -> None: ...
-    def close(self) -> None: ...
+    def feed(self) -> None:
+        """Give the thread what has come for it."""
+
+    def flush(self) -> None:
+        """Send what the thread has written."""
+
+    def close(self) -> None:
+        """Close what was opened for the thread."""
 
 
-class E727Side:
-    """Connects an E-727 on a serial line."""
+class E727Side(Side):
+    """Connects an E-727 on a serial line. The thread reads and writes the driver's own port and memory."""
 
     def __init__(self, driver: E727, clock: Clock) -> None:
         self._driver = driver
@@ -87,15 +93,6 @@ class E727Side:
         assert isinstance(port, Descriptor)
         return port.fileno()
 
-    def take_over(self, is_read_back: bool) -> None:
-        """The driver's memory is as it needs it."""
-
-    def begin(self) -> None:
-        """The thread reads the driver's own port."""
-
-    def catch_up(self) -> None:
-        """The thread reads the driver's own port."""
-
     def feed(self) -> None:
         port = self._driver.port
         assert isinstance(port, Fed)
@@ -105,9 +102,6 @@ class E727Side:
         port = self._driver.port
         assert isinstance(port, Fed)
         port.flush()
-
-    def close(self) -> None:
-        """The port is the bench's."""
 
 
 class VirtualCalls:
@@ -226,8 +220,8 @@ class VirtualCan(VirtualCalls):
         return self.error()
 
 
-class DacSide:
-    """Connects a DAC on an I2C bus, with or without a guardian."""
+class DacSide(Side):
+    """Connects a DAC on an I2C bus, with or without a guardian. A DAC sends nothing by itself."""
 
     def __init__(self, amplifier: GuardedAmplifier | DacOutput, clock: Clock) -> None:
         self._gate = amplifier.gate if isinstance(amplifier, GuardedAmplifier) else None
@@ -284,18 +278,6 @@ class DacSide:
             assert self._carrier is not None
             self._driver.pending = self._carrier.failure(failed, self._driver.address)
 
-    def begin(self) -> None:
-        """A DAC sends nothing by itself."""
-
-    def catch_up(self) -> None:
-        """A DAC sends nothing by itself."""
-
-    def feed(self) -> None:
-        """Transfers are made as the thread asks for them."""
-
-    def flush(self) -> None:
-        """See ``feed``."""
-
     def close(self) -> None:
         self._memory = None
         is_own = cast("object", self._carrier) is not self._driver.bus
@@ -303,7 +285,7 @@ class DacSide:
             self._carrier.close()
 
 
-class CanSide:
+class CanSide(Side):
     """Connects the CAN node."""
 
     def __init__(self, driver: CanAmplifier, clock: Clock) -> None:
@@ -370,12 +352,6 @@ class CanSide:
         if not isinstance(self._carrier, VirtualCan):
             with contextlib.suppress(HalError):  # the driver's next call says it
                 self._driver.forget_received()
-
-    def feed(self) -> None:
-        """Frames are received as the thread asks for them."""
-
-    def flush(self) -> None:
-        """See ``feed``."""
 
     def close(self) -> None:
         self._memory = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -101,12 +101,15 @@ def _ac_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
     grid: list[tuple[float, ...]] = [(float(t), s) for t in np.geomspace(5 * dt, 20 * span, 24) for s in (1.0, 0.0)]
-    return rank_starts(
-        grid,
-        lambda q: ctx.to_output(_ac_apply(x, ctx, np.array(q), settings)),
-        ctx.wanted(x, residual),
-        thin(ctx.keep, 8000),
-    )[:3]
+    return _best(lambda q: _ac_apply(x, ctx, np.array(q), settings), grid, x, residual, ctx)
+
+
+def _best(
+    output: Callable[[tuple[float, ...]], Array], grid: list[tuple[float, ...]], x: Array, residual: Array, ctx: Context
+) -> Sequence[Sequence[float]]:
+    """Return the three starts of ``grid`` whose output explains the residual best."""
+    wanted, k = ctx.wanted(x, residual), thin(ctx.keep, 8000)
+    return rank_starts(grid, lambda q: ctx.to_output(output(q)), wanted, k)[:3]
 
 
 def _twice_parts(settings: Settings) -> Parts:
@@ -147,12 +150,7 @@ def _twice_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
     grid: list[tuple[float, ...]] = [
         (float(t), d, s) for t in np.geomspace(5 * dt, 20 * span, 20) for d in (0.6, 1.1) for s in (1.0, 0.0)
     ]
-    return rank_starts(
-        grid,
-        lambda q: ctx.to_output(_twice_apply(x, ctx, np.array(q), settings)),
-        ctx.wanted(x, residual),
-        thin(ctx.keep, 8000),
-    )[:3]
+    return _best(lambda q: _twice_apply(x, ctx, np.array(q), settings), grid, x, residual, ctx)
 
 
 def _twice_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

@@ -13,15 +13,40 @@ from pathlib import Path
 import pytest
 
 from tools.research.reproduce import endoscope, real_sensors, sensing_static, sensing_variance
-from tools.research.reproduce.measured_page import outcomes
+from tools.research.reproduce.measured_page import parts_of
+from tools.research.reproduce.measured_sets import SETS
 from tools.research.reproduce.names import MODULES, reproduce_table
 from tools.research.reproduce.recordings import data_folder
-from tools.research.reproduce.rows import Row, Table, expected_outcomes, keys, surprises
+from tools.research.reproduce.rows import Row, Table, expected_outcomes, keys
 from tools.research.results.artefact import read_page
 
 TABLES = tuple(name for name in MODULES if name != "measured")
 """The diagnoses of ``measured`` take an hour: its pinned outcomes are compared with its artefact."""
 MEASURED = Path(__file__).parents[2] / "docs" / "results" / "mismatch-measured.json"
+
+
+def surprises(table: str, rows: Sequence[Row]) -> list[str]:
+    """Return the rows without the expected outcome, in words. Absent rows surprise nobody."""
+    pinned = expected_outcomes(table)
+    return [
+        f"{key}: {'met' if row.meets else 'missed'} ({row.ours:.4g}, published {row.published:.4g}), "
+        f"{'not expected' if key in pinned else 'not in expected.json'}"
+        for row, key in zip(rows, keys(rows), strict=True)
+        if row.meets is not pinned.get(key)
+    ]
+
+
+def outcomes(page: str) -> dict[str, bool]:
+    """Return whether each row of a page that ``document`` made is met, by its key (``keys``)."""
+    cells, _ = parts_of(page)
+    rows: list[Row] = []
+    for s in (s for s in SETS if s.name in cells):
+        quantity, ours = f"residual rms, {s.title}", float(cells[s.name][4] or "nan")
+        rows += [Row(p.source, quantity, s.unit, "", p.figure, ours, "lower", "recording") for p in s.published]
+        if s.goal is not None:
+            met = 0.0 if cells[s.name][8] == "yes" else 1.0
+            rows.append(Row("goal of the project", quantity, s.unit, "", 0.0, met, "lower", "recording"))
+    return {key: row.meets for key, row in zip(keys(rows), rows, strict=True)}
 
 
 def row(ours: float, quantity: str = "q") -> Row:
@@ -30,8 +55,9 @@ def row(ours: float, quantity: str = "q") -> Row:
 
 @pytest.fixture
 def pinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    outcomes = {"t": {"s: q": True, "s: q (2)": False, "s: other": True}}
-    monkeypatch.setattr("tools.research.reproduce.rows.expected_outcomes", lambda name: outcomes.get(name, {}))
+    expected = {"t": {"s: q": True, "s: q (2)": False, "s: other": True}}
+    monkeypatch.setattr("tools.research.reproduce.rows.expected_outcomes", lambda name: expected.get(name, {}))
+    monkeypatch.setattr(f"{__name__}.expected_outcomes", lambda name: expected.get(name, {}))
 
 
 @pytest.mark.usefixtures("pinned")

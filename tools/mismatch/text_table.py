@@ -49,7 +49,6 @@ class TextTable:
     units: tuple[str, ...]
     text: tuple[tuple[str, str], ...]
     first: int
-    has_header: bool
     samples: bool
 
     @property
@@ -130,7 +129,7 @@ def text_table(path: Path) -> TextTable:
     rows = [(number, _cells(line, delimiter), line) for number, line in lines]
     plain = [row for row in rows if not row[2].lstrip().startswith(_COMMENT)]
     if not plain:
-        return TextTable(path, encoding, delimiter, decimal, (), (), (), 1, True, False)
+        return TextTable(path, encoding, delimiter, decimal, (), (), (), 1, False)
     last = [cells for _, cells, _ in plain[-max(1, len(plain) // 2) :]]
     width = max({len(c) for c in last}, key=[len(c) for c in last].count)
     of_numbers = [sum(_is_number(c[i], decimal) for c in last if len(c) == width) > 0 for i in range(width)]
@@ -138,7 +137,6 @@ def text_table(path: Path) -> TextTable:
     first = plain[begin][0] if begin < len(plain) else plain[-1][0] + 1
     above = [(cells, line) for number, cells, line in rows if number < first]
     names, row_of_units = _header(path, above, delimiter, width)
-    has_header = bool(names)
     names = names or [f"column_{i + 1}" for i in range(width)]
     empty = [not names[i] and not any(c[i] for c in last if len(c) > i) for i in range(len(names))]
     while names and empty[len(names) - 1]:  # lines that end with a delimiter
@@ -153,9 +151,7 @@ def text_table(path: Path) -> TextTable:
     ]  # fmt: skip
     column_units = (*row_of_units, *[""] * len(names))[: len(names)]
     samples = begin < len(plain)
-    return TextTable(
-        path, encoding, delimiter, decimal, tuple(names), column_units, tuple(words), first, has_header, samples
-    )
+    return TextTable(path, encoding, delimiter, decimal, tuple(names), column_units, tuple(words), first, samples)
 
 
 def _head(path: Path) -> tuple[str, str, bool]:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from firmware_py.tremor.config import TremorConfig
 from tools.research.tremor.adapting import LEADS_S, adapting
-from tools.research.tremor.cases import emulated_hand, shorter
+from tools.research.tremor.cases import RATE_HZ, emulated_hand
 
 
 def test_a_hand_is_known_better_after_a_while_and_short_records_are_left_out() -> None:
     hand = emulated_hand(31, 26.0)
-    found = adapting([hand, shorter(hand, 20.0)], 2)
+    begin = slice(round(20.0 * RATE_HZ))
+    slow = None if hand.slow is None else hand.slow[begin]
+    shorter = replace(hand, samples=hand.samples[begin], truth=hand.truth[begin], slow=slow)
+    found = adapting([hand, shorter], 2)
     (ratios,) = found.values()
     assert len(ratios) == len(LEADS_S)
     assert ratios[-1] == 1.0

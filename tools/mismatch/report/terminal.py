@@ -16,6 +16,7 @@ from tools.mismatch.report import wording
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.next_experiment import next_experiments
 from tools.mismatch.report.wording import chance, number, percent, words
+from tools.terminal import pairs_of
 
 _COLOUR = {"agrees": "green", "recalibrate": "cyan", "missing_physics": "yellow", "unexplained": "magenta"}
 
@@ -31,30 +32,21 @@ def _section(title: str, body: RenderableType) -> RenderableType:
     return Group(Text(f"\n{title}", style="bold underline"), Padding(body, (0, 0, 0, 2)))
 
 
-def _pairs(rows: Sequence[tuple[str, str]]) -> Table:
-    t = Table.grid(padding=(0, 2, 0, 0))
-    t.add_column(style="dim", no_wrap=True)
-    t.add_column(overflow="fold")
-    for name, value in rows:
-        t.add_row(name, Text(value))
-    return t
-
-
 def _where(report: Report) -> RenderableType:
     location = report.location
     marked = wording.guilty_stages(report)
     chain = Text(" › ").join(
         Text(f"[{s}]" if s in marked else s, "bold red" if s in marked else "") for s in report.chain
     )
-    t = Table.grid(padding=(0, 2, 0, 0))
-    t.add_column(style="dim", no_wrap=True)
-    t.add_column(overflow="fold")
-    t.add_row("outputs", Text(", ".join(location.outputs) or "none"))
-    t.add_row("chain", chain)
-    t.add_row("when", Text(wording.windows(location)))
-    t.add_row("regime", Text(location.regime))
-    t.add_row("follows", Text(wording.follows(location)))
-    return t
+    return pairs_of(
+        [
+            ("outputs", ", ".join(location.outputs) or "none"),
+            ("chain", chain),
+            ("when", wording.windows(location)),
+            ("regime", location.regime),
+            ("follows", wording.follows(location)),
+        ]
+    )
 
 
 def _physics(k: int, p: PhysicsFound, report: Report) -> RenderableType:
@@ -74,7 +66,7 @@ def _physics(k: int, p: PhysicsFound, report: Report) -> RenderableType:
         rows.append(("place", f"{p.note}: this recording cannot tell"))
     if p.at_bound:
         rows.append(("caution", f"at the limit of what is searched: {', '.join(p.at_bound)}"))
-    return Group(head, Padding(Group(t, _pairs(rows)), (0, 0, 0, 3)))
+    return Group(head, Padding(Group(t, pairs_of(rows)), (0, 0, 0, 3)))
 
 
 def _fit(report: Report) -> Table:
@@ -118,7 +110,7 @@ def _limits(report: Report) -> Table:
         if report.verdict in ("missing_physics", "unexplained") and len(limits) > 3:
             limits = [f"{limits[0]} .. {limits[-1]} (all in --json and --html)"]
         rows.append((f"{o} ({unit} rms)", ", ".join(limits) or "none"))
-    return _pairs(rows)
+    return pairs_of(rows)
 
 
 def _checks(report: Report) -> Table:
@@ -133,14 +125,14 @@ def _checks(report: Report) -> Table:
     if report.hold:
         rows.append(("inputs", wording.hold(report)))
     rows += [("look at", m) for m in wording.cautions(report)]
-    return _pairs(rows)
+    return pairs_of(rows)
 
 
 def _together(together: Together, fit: FitSummary) -> RenderableType:
     rows = [("left out", f"{o}: {figures}") for o, figures in words_together.score_rows(together, fit)]
     rows += [("changes", line) for line in words_together.change_lines(together)]
     rows += [(p.name, words_together.range_text(p)) for p in together.parameters]
-    return _pairs(rows)
+    return pairs_of(rows)
 
 
 def render(report: Report) -> RenderableType:
@@ -173,18 +165,18 @@ def render(report: Report) -> RenderableType:
         parts.append(_section("Runners-up", _runners_up(report)))
     if report.withheld:
         of = [(words(w.name), f"{w.output}: {wording.why_withheld(w, report.fit)}") for w in report.withheld]
-        parts.append(_section("Tried and not named", _pairs(of)))
+        parts.append(_section("Tried and not named", pairs_of(of)))
     if report.equivalent:
         lines = [f"{' = '.join(words(n) for n in e.names)}: {words(e.tell_apart_by)}" for e in report.equivalent]
         parts.append(_section("This recording cannot tell apart (what would)", Text("\n".join(lines))))
     parts.append(_section("Smallest effect that would have been named", _limits(report)))
     if report.cannot_show:
         rows = [(words(n), need) for n, need in report.cannot_show.items()]
-        parts.append(_section("This recording cannot show at all (what would)", _pairs(rows)))
+        parts.append(_section("This recording cannot show at all (what would)", pairs_of(rows)))
     parts.append(_section("Checks", _checks(report)))
-    parts.append(_section("Split", _pairs(wording.data_parts(report))))
+    parts.append(_section("Split", pairs_of(wording.data_parts(report))))
     rows = [(f"{i + 1}.", f"{e.what}: {e.why}") for i, e in enumerate(next_experiments(report))]
-    parts.append(_section("Record next", _pairs(rows)))
+    parts.append(_section("Record next", pairs_of(rows)))
     parts.append(
         Text(f"\n{report.recording}, twin {report.twin}, seed {report.seed}, {report.seconds:.1f} s", style="dim")
     )

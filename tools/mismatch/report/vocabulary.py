@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context, Effect
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.wording import words
+from tools.terminal import pairs_of
 
 UNITS = "units: {in} and {out} are those of the twin's input and output"
 
@@ -112,9 +112,6 @@ def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
     """Print the vocabulary on a terminal."""
     for e in found:
         console.print(Text.assemble((e.name, "bold yellow"), "  ", e.summary))
-        t = Table.grid(padding=(0, 2, 0, 0))
-        t.add_column(style="dim", no_wrap=True)
-        t.add_column(overflow="fold")
         rows = [("formula", "\n".join(map(plain, e.equations)))]
         rows.append(("parameters", ", ".join(f"{n} ({u})" if u != "1" else n for n, u in e.parameters)))
         rows.append(("where", f"{', '.join(e.stages)}; {e.acts}"))
@@ -126,7 +123,5 @@ def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
         if e.confusable_with:
             rows.append(("looks like", ", ".join(words(n) for n in e.confusable_with)))
         rows.append(("source", e.source))
-        for name, value in rows:
-            t.add_row(name, Text(value))
-        console.print(Padding(t, (0, 0, 1, 2)))
+        console.print(Padding(pairs_of(rows), (0, 0, 1, 2)))
     console.print(Text(UNITS, "dim"))

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 import typer
 from rich.progress import track
-from rich.table import Table
 
 from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, check_recording_name, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+from tools.terminal import table_of
 
 endoscope = typer.Typer(
     help="Let a synthetic user steer the endoscope's field of view with the motion card (Erat 2018, chapter 6)."
@@ -117,9 +117,8 @@ def play_command(
 def _show(user: str, result: dict[str, Any]) -> None:
     time = f" in {result['elapsed_s']:.1f} s" if result["reached"] else ""
     title = f"{user}: {result['reached']} of {result['targets']} targets{time}, "
-    table = Table(title=title + f"{result['clicks']} clicks, {result['mapping']} mapping", title_justify="left")
-    for column in ("target", "time (s)", "clicks", "psi (deg)", "theta (deg)"):
-        table.add_column(column, justify="right")
+    title += f"{result['clicks']} clicks, {result['mapping']} mapping"
+    table = table_of(title, "target", "time (s)", "clicks", "psi (deg)", "theta (deg)", left=0)
     for row in result["rows"]:
         psi, theta = (f"{row[f'{a}_min_deg']:.1f} .. {row[f'{a}_max_deg']:.1f}" for a in ("psi", "theta"))
         table.add_row(str(row["target"]), f"{row['elapsed_s']:.1f}", str(row["clicks"]), psi, theta)
@@ -149,9 +148,9 @@ def tables(
             run_cell(mapping_of(mapping), tau, person, gain=gain, experiments=experiments)
             for mapping, tau in track(jobs, "playing", console=console(), transient=True)
         ]
-        grid = Table(title=f"synthetic user, K = {gain:g}, {experiments} experiments a cell", title_justify="left")
-        for column in ("mapping", "tau (s)", "time (s)", "mean (s)", "clicks", "psi, theta (deg)"):
-            grid.add_column(column, justify="right")
+        title = f"synthetic user, K = {gain:g}, {experiments} experiments a cell"
+        headings = ("mapping", "tau (s)", "time (s)", "mean (s)", "clicks", "psi, theta (deg)")
+        grid = table_of(title, *headings, left=0)
         for cell in cells:
             times = " ".join(f"{v:.0f}" for v in cell.elapsed_s)
             psi, theta = cell.rotation_deg

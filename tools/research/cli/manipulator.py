@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console, place_picture
 from tools.output import check_writable, write_json
+from tools.terminal import table_of
 
 PICTURE = Path("out/workspace.png")
 """Default file of the picture."""
@@ -41,9 +41,7 @@ def manipulator(
         picture = place_picture(out, PICTURE)
         config = load_plan(load_bench(bench_path(bench))).stages.actuation
         analysis = analyse(config)
-        table = Table(title="Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", title_justify="left")
-        for heading in ("quantity", "required", "ours"):
-            table.add_column(heading, justify="left" if heading == "quantity" else "right")
+        table = table_of("Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", "quantity", "required", "ours")
         x, y, z = analysis.extent_m * 1e6
         table.add_row("extent x (um)", "> 1000", f"{x:.0f}")
         table.add_row("extent y (um)", "> 1000", f"{y:.0f}")

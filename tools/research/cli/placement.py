@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
+from tools.terminal import table_of
 
 
 def placement(
@@ -47,9 +47,9 @@ def placement(
         except ValueError as error:
             raise InputError(str(error)) from error
         tip = np.array(space.tip_mm) * 1e-3
-        table = Table(title=f"{space.title}, {1e3 * space.noise_m_s2:g} mm/s^2 per axis", title_justify="left")
-        for heading in ("placement", "alpha_x", "alpha_y", "alpha_z", "vector (rad/s^2)", "tip (mm/s^2)"):
-            table.add_column(heading, justify="left" if heading == "placement" else "right")
+        title = f"{space.title}, {1e3 * space.noise_m_s2:g} mm/s^2 per axis"
+        headings = ("placement", "alpha_x", "alpha_y", "alpha_z", "vector (rad/s^2)", "tip (mm/s^2)")
+        table = table_of(title, *headings)
         rows = (best.placement, micron_004(), micron_004_turned(), cube_004(), proposed_004())
         for p in rows:
             noise = angular_noise(p, space.noise_m_s2)

@@ -12,6 +12,7 @@ from hal.types import STANDARD_GRAVITY
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
+from tools.terminal import table_of
 
 app = typer.Typer(help="Compute error budgets of the sensing stage on emulated sensors.")
 
@@ -33,9 +34,8 @@ def budget(
         check_writable(json_file)
         with console().status("calibrating and running every variant"):
             budget = compute(seconds)
-        table = Table(title="Tip displacement, 8 to 12 Hz, rms error (um, vector)", title_justify="left")
-        for heading in ("source", "alone", "all but this", "share of the square"):
-            table.add_column(heading, justify="left" if heading == "source" else "right")
+        title = "Tip displacement, 8 to 12 Hz, rms error (um, vector)"
+        table = table_of(title, "source", "alone", "all but this", "share of the square")
         for share in sorted(budget.shares, key=lambda s: -s.share):
             table.add_row(
                 share.source, f"{share.alone_um:.2f}", f"{share.without_um:.2f}", f"{100.0 * share.share:.1f} %"

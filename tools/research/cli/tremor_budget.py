@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
-from rich.table import Table
 
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
@@ -15,7 +14,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
-from tools.terminal import progress_bar, task_name
+from tools.terminal import progress_bar, table_of, task_name
 
 
 def budget(
@@ -51,11 +50,8 @@ def budget(
             rows = list(runs(bench_path(bench), seconds, lambda text: progress.update(task, description=text)))
         if json_file != "-":
             title = "tip tremor in 8-12 Hz, and the cost of each source in four bands, um rms (vectors)"
-            table = Table(title=title, title_justify="left")
-            table.add_column("taken away")
             costs = (f"cost {band_name(band)}" for band in FOUR_BANDS_HZ)
-            for name in ("without the loop", "with it", "less (%)", *costs):
-                table.add_column(name, justify="right")
+            table = table_of(title, "taken away", "without the loop", "with it", "less (%)", *costs)
             for row in rows:
                 figures = (row.uncompensated_rms_um, row.compensated_rms_um, row.reduction_percent)
                 name = "nothing: all errors on" if row is rows[0] else row.source
@@ -79,10 +75,9 @@ def _ideal(bench: Path, seconds: float, json_file: str | None) -> None:
             progress.update(task, description=f"ideal instrument, accelerometer noise {'on' if noise else 'off'}")
             rows.append(ideal_run(bench, seconds, noise))
     if json_file != "-":
-        table = Table(title="ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted", title_justify="left")
-        table.add_column("sensors")
-        for name in ("loop", "estimator alone", "bound", f"loop / bound, goal {GOAL:g}", "less in 8-12 Hz (%)"):
-            table.add_column(name, justify="right")
+        title = "ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted"
+        ratio = f"loop / bound, goal {GOAL:g}"
+        table = table_of(title, "sensors", "loop", "estimator alone", "bound", ratio, "less in 8-12 Hz (%)")
         for row in rows:
             figures = (row.loop_um, row.estimator_um, row.bound_um, row.ratio, row.reduction_percent)
             table.add_row(row.what, *(f"{v:.2f}" for v in figures))

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 from tools.research.reproduce.measured_rows import Scored, explained, rows_of
 from tools.research.reproduce.measured_sets import SETS
-from tools.research.reproduce.rows import Row, keys
 
 _HEAD = (
     "Made by `micron reproduce measured --out docs/results/mismatch-measured.json`; do not edit. Each set starts from "
@@ -37,7 +36,7 @@ def document(found: Sequence[Scored], before: str = "") -> str:
     for the sets that are not in ``found``.
     """
     new = {f.name: f for f in found}
-    rows, sections = _parts(before)
+    rows, sections = parts_of(before)
     rows |= {f.name: _row(f) for f in found}
     sections |= {_SET[f.name].title: _section(f) for f in found}
     listed = [s for s in SETS if s.name in rows]
@@ -67,26 +66,13 @@ def document(found: Sequence[Scored], before: str = "") -> str:
 _SET = {s.name: s for s in SETS}
 
 
-def _parts(page: str) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+def parts_of(page: str) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Cells of the table by set, and lines of the sections by title, of a page that ``document`` made."""
     head, *rest = re.split(r"^## (.+)$", page, flags=re.MULTILINE)
     cells = [[c.strip() for c in line.strip("| ").split(" | ")] for line in head.splitlines() if line.startswith("| ")]
     pairs = zip(rest[::2], rest[1::2], strict=True)
     sections = {title: [f"## {title}", "", *text.strip().splitlines(), ""] for title, text in pairs}
     return {c[0]: c for c in cells if c[0] in _SET}, sections
-
-
-def outcomes(page: str) -> dict[str, bool]:
-    """Return whether each row of a page that ``document`` made is met, by its key (``rows.keys``)."""
-    cells, _ = _parts(page)
-    rows: list[Row] = []
-    for s in (s for s in SETS if s.name in cells):
-        quantity, ours = f"residual rms, {s.title}", float(cells[s.name][4] or "nan")
-        rows += [Row(p.source, quantity, s.unit, "", p.figure, ours, "lower", "recording") for p in s.published]
-        if s.goal is not None:
-            met = 0.0 if cells[s.name][8] == "yes" else 1.0
-            rows.append(Row("goal of the project", quantity, s.unit, "", 0.0, met, "lower", "recording"))
-    return {key: row.meets for key, row in zip(keys(rows), rows, strict=True)}
 
 
 def _row(f: Scored) -> list[str]:

@@ -85,17 +85,6 @@ def expected_outcomes(table: str) -> dict[str, bool]:
     return expected.get(table, {})
 
 
-def surprises(table: str, rows: Sequence[Row]) -> list[str]:
-    """Rows of ``rows`` without an expected outcome or with another one, in words. Absent rows surprise nobody."""
-    pinned = expected_outcomes(table)
-    return [
-        f"{key}: {'met' if row.meets else 'missed'} ({row.ours:.4g}, published {row.published:.4g}), "
-        f"{'not expected' if key in pinned else 'not in expected.json'}"
-        for row, key in zip(rows, keys(rows), strict=True)
-        if row.meets is not pinned.get(key)
-    ]
-
-
 Section = Callable[[], Sequence[Row]]
 
 

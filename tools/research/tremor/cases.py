@@ -8,7 +8,7 @@ and the sensor's noise does not: unless told otherwise a hand is scaled to the i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -197,13 +197,6 @@ def rc_filter(x: Array) -> Array:
     keep = np.exp(-TremorConfig().filter_cutoff_rad_s / RATE_HZ)
     centred = 0.5 * (1.0 - keep)
     return np.asarray(lfilter([centred, centred], [1.0, -keep], x, axis=0))
-
-
-def shorter(case: Case, seconds: float) -> Case:
-    """The first ``seconds`` of a case."""
-    n = round(seconds * RATE_HZ)
-    slow = None if case.slow is None else case.slow[:n]
-    return replace(case, samples=case.samples[:n], truth=case.truth[:n], slow=slow)
 
 
 def low_pass(x: Array, hz: float) -> Array:
