@@ -34,7 +34,7 @@ def inspect(
     Says so when the stated sampling rate is not the real one. Example:
     micron tremor inspect ../shared/data/tremor_mouse_lsm9ds1#23/gyro --png out/23.png
     """
-    from tools.research.tremor.inspect import Inspection, Rule, inspect_all
+    from tools.research.tremor.inspect import Inspection, Rule, inspect
     from tools.research.tremor.signals import load_signals
 
     def table(inspections: list[Inspection], whole: bool) -> Table:
@@ -75,7 +75,8 @@ def inspect(
             raise InputError(
                 f"--png shows one signal, {recording} holds {len(signals)}: choose one with #NAME ({names})"
             )
-        result = inspect_all(signals, Rule(band_hz=(low_hz, high_hz)))
+        rule = Rule(band_hz=(low_hz, high_hz))
+        result = [inspect(signal, rule) for signal in signals]
         for note in dict.fromkeys(note for s in signals for note in s.notes):
             console().print(f"note: {note}", soft_wrap=True)
         if json_file != "-":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,7 +51,6 @@ def play_on_bench(
     seed: int | None = None,
     record: Path | None = None,
     limit_s: float = LIMIT_S,
-    on_status: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """The user turns the emulated card and presses its button; lines, driver, filter and control do the rest.
 
@@ -74,7 +72,7 @@ def play_on_bench(
     with open_requested(request, led, None) as opened:
         hands = _HandsOn(opened, next(iter(cards)), SyntheticUser(user, task_of(config.game)))
         plan = EndoscopePlan(led, config, hands.see, until_done=True)
-        return run_plan(request, plan, opened, on_status)[1]
+        return run_plan(request, plan, opened, None)[1]
 
 
 class _HandsOn:

@@ -24,7 +24,7 @@ from tools.research.faults.fault import Fault
 from tools.research.faults.judge import ENDED_WELL, Observation
 from tools.research.faults.pairs import draw_pairs
 from tools.research.faults.phases import LEARNING, PHASES, START, STEADY, Phase, accepted_answers
-from tools.research.faults.points import POINTS, Point, write_bench
+from tools.research.faults.points import POINTS, write_bench
 from tools.research.faults.trial import observe_running, observe_start
 
 NUMBERS = re.compile(r"-?\d+\.\d+")
@@ -172,8 +172,6 @@ def run_campaign(
     bench: Path,
     faults: Sequence[Fault],
     *,
-    points: Sequence[Point] = POINTS,
-    phases: Sequence[Phase] = PHASES,
     seeds: Sequence[int],
     n_pairs: int = 0,
     jobs: int,
@@ -195,7 +193,7 @@ def run_campaign(
         faults = [fault.with_read_back() for fault in faults]
     folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
     try:
-        benches = {point.name: write_bench(bench, point, folder) for point in points}
+        benches = {point.name: write_bench(bench, point, folder) for point in POINTS}
         what = repr((revision, bench.read_text(encoding="utf-8"), faults, compiled))
         key = hashlib.sha256(what.encode()).hexdigest()[:16]
         kept = _Kept(keep, key)
@@ -203,15 +201,15 @@ def run_campaign(
         running = tuple(fault for fault in faults if not fault.at_start)
         planned = [
             Trial(benches[point.name], point.name, phase, group, seed, compiled=compiled)
-            for point in points
+            for point in POINTS
             for seed in seeds
-            for phase, group in [(None, at_start), *((phase, running) for phase in phases)]
+            for phase, group in [(None, at_start), *((phase, running) for phase in PHASES)]
             if group
         ]
         pairs = draw_pairs(running, n_pairs, seeds[0])
         for k, group in enumerate(pairs):
-            point = points[k % len(points)]
-            phase = phases[k // len(points) % len(phases)]
+            point = POINTS[k % len(POINTS)]
+            phase = PHASES[k // len(POINTS) % len(PHASES)]
             planned.append(Trial(benches[point.name], point.name, phase, group, seeds[0] + k, True, compiled))
         trials = [trial for trial in planned if kept.read(trial) is None]
         done = [observations for trial in planned if (observations := kept.read(trial)) is not None]
@@ -227,7 +225,7 @@ def run_campaign(
         return [
             FaultRow(fault, point.name, tuple(sorted(rows, key=lambda o: (o.seed, o.phase))))
             for fault in (*faults, *chain(*pairs))
-            for point in points
+            for point in POINTS
             if (rows := found.get((fault.name, point.name)))
         ]
     finally:

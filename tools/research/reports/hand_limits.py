@@ -162,4 +162,4 @@ def band_parts(
 
 def causal_um(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> float:
     """um rms left in 8 to 12 Hz by the best causal linear filter, fitted to this very hand; no stroke ends."""
-    return band_rms_um(bound_residual(truth, keep, noise=True), keep)
+    return band_rms_um(bound_residual(truth, keep), keep)

@@ -95,7 +95,6 @@ def search(
 def study(
     people: list[Subject],
     making: Making,
-    how: Training | None = None,
     windows: Sequence[tuple[int, int]] = WINDOWS,
     motions: int = 2,
     with_error_target: bool = True,
@@ -103,7 +102,7 @@ def study(
 ) -> Study:
     """Everything of section 5.3.4. Networks see a person's first file (``subjects`` puts the one of median size first);
     tests use another voluntary motion."""
-    how = how or Training()
+    how = Training()
     wanted = voluntary(making, TEST_SEED)
 
     def own(target_how: Training) -> tuple[SubjectResult, ...]:

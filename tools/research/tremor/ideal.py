@@ -124,12 +124,13 @@ def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) 
     return loop, alone, bound
 
 
-def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> Array:
+def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> Array:
     """(n, 3) m: what the best fixed causal linear filter of this very record leaves of the involuntary motion.
 
-    Fitted over the rows ``keep``, lifted, at ``LOOP_DELAY_S``, to the tip's acceleration behind the sensor's filter.
+    Fitted over the rows ``keep``, lifted, at ``LOOP_DELAY_S``, to the tip's acceleration behind the sensor's filter,
+    with the sensors' noise.
     """
-    return _bound(_samples(truth, noise), _wanted(truth), keep)
+    return _bound(_samples(truth, noise=True), _wanted(truth), keep)
 
 
 def left_and_bound(truth: Mapping[str, Array], keep: NDArray[np.bool_], delay_s: float) -> tuple[float, float]:

@@ -8,7 +8,6 @@ narrow and not drowned by the rest of the motion. The rule has no unit: it serve
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -204,15 +203,3 @@ def _harmonics(spectrum: Spectrum, at_hz: float, half_width_hz: float, rate_hz: 
         else float("nan")
         for n in HARMONICS
     )
-
-
-def inspect_all(
-    signals: list[TremorSignal], rule: Rule | None = None, progress: Callable[[str], None] | None = None
-) -> list[Inspection]:
-    """Each signal in turn."""
-    found: list[Inspection] = []
-    for signal in signals:
-        if progress is not None:
-            progress(signal.name)
-        found.append(inspect(signal, rule))
-    return found
