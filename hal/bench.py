@@ -26,23 +26,19 @@ from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.toml_file import parse_toml, read_text
 from hal.trust import is_our_package, path_inside, require_package
-from hal.validation import validate_table
+from hal.validation import StrictTable, validate_table
 
 SIM_SCHEME = "sim://"
 Port = SerialPort | I2cBus | CanBus
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ClockSpec(_Strict):
+class ClockSpec(StrictTable):
     """Holds the rate of the firmware's tick. Task rates are whole divisions of it."""
 
     tick_hz: int = Field(default=1000, ge=10, le=10_000)
 
 
-class SerialSpec(_Strict):
+class SerialSpec(StrictTable):
     """Describes a serial port. USB CDC devices ignore ``baud``."""
 
     kind: Literal["serial"]
@@ -50,7 +46,7 @@ class SerialSpec(_Strict):
     baud: int = Field(default=115_200, ge=300, le=4_000_000)
 
 
-class I2cSpec(_Strict):
+class I2cSpec(StrictTable):
     """Describes an I2C bus. The controller is set to ``speed_hz``, and the bus-load check uses it."""
 
     kind: Literal["i2c"]
@@ -58,7 +54,7 @@ class I2cSpec(_Strict):
     speed_hz: int = Field(default=400_000, ge=10_000, le=3_400_000)
 
 
-class CanSpec(_Strict):
+class CanSpec(StrictTable):
     """Describes a CAN bus with classic frames."""
 
     kind: Literal["can"]
@@ -85,7 +81,7 @@ class DeviceSpec(BaseModel):
         return dict(self.__pydantic_extra__ or {})
 
 
-class BenchDescription(_Strict):
+class BenchDescription(StrictTable):
     """Holds the content of a bench file. The readers of ``emulation`` and ``firmware`` check those tables."""
 
     format: Literal[1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hal.errors import BenchError
 
@@ -15,6 +15,12 @@ Positive = Annotated[float, Field(gt=0.0, le=1e12)]
 """Any quantity of a configuration in its unit; beyond the limit nothing is meant, and products overflow."""
 NotNegative = Annotated[float, Field(ge=0.0, le=1e12)]
 """The same with zero."""
+
+
+class StrictTable(BaseModel):
+    """Refuses keys that it does not know, and does not change once it is made."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def describe_validation_error(error: ValidationError, where: str) -> str:

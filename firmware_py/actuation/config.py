@@ -6,22 +6,20 @@ from collections.abc import Mapping
 from typing import Annotated, Any, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from hal.validation import Positive, validate_table
+from hal.validation import Positive, StrictTable, validate_table
 
 Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=16)]
 
 
-class StackConfig(BaseModel):
+class StackConfig(StrictTable):
     """Holds the modified Prandtl-Ishlinskii model of one stack, Ang 2004 (7.9): weights in um per V, thresholds in V
     and um.
 
     The default is a P-885.50 by its data sheet shape: 15 um at 100 V on the first way up, a small-signal slope
     of 70 % of that. ``micron calibrate piezo`` replaces it by the stack's own.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     play_thresholds_V: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 31.0, 38.0, 45.0)
     play_weights_um_per_V: tuple[float, ...] = (
@@ -76,10 +74,8 @@ class StackConfig(BaseModel):
         return self
 
 
-class ActuationConfig(BaseModel):
+class ActuationConfig(StrictTable):
     """Sets the manipulator's geometry, the stacks, the limits and how compensation fades in."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     tick_hz: Positive = 1000.0
     gain: Annotated[float, Field(ge=0.0, le=2.0)] = 1.0

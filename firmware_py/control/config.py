@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from firmware_py.control.plausibility import PlausibilityLimits
 from firmware_py.run.safety import SafetyLimits, SelfTestLimits
+from hal.validation import StrictTable
 
 
-class FirmwareConfig(BaseModel):
+class FirmwareConfig(StrictTable):
     """Holds the checked [firmware] table. The tables of the three stages are checked by ``StageConfigs``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     safety: SafetyLimits = SafetyLimits()
     self_test: SelfTestLimits = SelfTestLimits()

@@ -18,11 +18,12 @@ from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from firmware_py.frame import ACCELEROMETER, LAYOUT
 from firmware_py.records import Array, Integers, Records, attributes, field, new, record
 from hal.compiled import kernel
+from hal.validation import StrictTable
 
 SENSORS = 6
 PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
@@ -33,7 +34,7 @@ Rail = Annotated[float, Field(ge=-10.0, le=10.0)]
 Step = Annotated[float, Field(ge=0.001, le=50.0)]
 
 
-class PlausibilityLimits(BaseModel):
+class PlausibilityLimits(StrictTable):
     """Sets limits that no healthy sensor exceeds. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter.
 
     ``outlier_V`` limits the second difference of an accelerometer's readings, ``magnetometer_outlier_V`` that of the
@@ -43,8 +44,6 @@ class PlausibilityLimits(BaseModel):
     relative to their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` on (x and y: 1.3 rad/s^2 over the
     distance of the two; z: 6 rad/s^2 about the instrument) plus PAIR_SPREADS times their spread.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     jump_V: float = Field(default=0.03, ge=0.001, le=5.0)
     rail_V: tuple[Rail, Rail] = (0.4, 4.6)

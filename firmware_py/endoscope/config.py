@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from firmware_py.endoscope.targets import GameConfig
 from firmware_py.run.safety import SafetyLimits
 from firmware_py.sensing.fusion import FusionConfig
 from hal.bench import BenchFile
 from hal.errors import BenchError
-from hal.validation import validate_table
+from hal.validation import StrictTable, validate_table
 
 
-class EndoscopeConfig(BaseModel):
+class EndoscopeConfig(StrictTable):
     """Holds the checked [firmware] table of an endoscope bench. ``steered_by`` names the device whose turning moves the
     view; empty: the motion card, else the first sensor.
 
@@ -22,8 +22,6 @@ class EndoscopeConfig(BaseModel):
     0.1 s). ``silent_ms``: after this time without a sample the view is held. ``safety``: when a hold ends, and when it
     ends the run. ``budget_us``: budgets of tasks, by name; a sensor's task has the name of its device.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     fusion: FusionConfig = FusionConfig(method="error-state")
     """Mahony, which Erat 2018 chose, follows every acceleration; see docs/endoscope.md."""

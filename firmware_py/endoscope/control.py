@@ -12,16 +12,16 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from hal.validation import StrictTable
 
 INACTIVE, MOVE, ZOOM = 0, 1, 2
 Mapping = Literal["position", "speed"]
 
 
-class ControlConfig(BaseModel):
+class ControlConfig(StrictTable):
     """``gain``: pixels per degree (mapping "position") or pixels per second and degree ("speed"), K of (6.5)-(6.10)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     mapping: Mapping = "position"
     gain: float = Field(default=8.0, gt=0.0, le=1000.0)

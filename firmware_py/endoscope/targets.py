@@ -18,22 +18,21 @@ import random
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from drivers.motion_card_protocol import ActivationButton, SpikeFilter
 from firmware_py.endoscope.control import INACTIVE, ControlConfig, EndoscopeControl, View
+from hal.validation import StrictTable
 
 LONGEST_STEP_S = 0.1
 """Longest time step that is used: a page that was hidden must not move the view by what it missed."""
 
 
-class GameConfig(BaseModel):
+class GameConfig(StrictTable):
     """The experiment of section 6.3: K = 8, tau = 0.25 s, tolerance 9 pixels, five targets. Screen and sizes are ours.
 
     ``apart_px``: a target is at least so far from the last one (0 where nobody cares).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     control: ControlConfig = ControlConfig()
     targets: int = Field(default=5, ge=1, le=1000)

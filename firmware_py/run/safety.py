@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from firmware_py.run.findings import CauseClass, Finding
 from hal.contracts import AnalogOutput, ArmsInSteps
 from hal.errors import HalError, I2cNack
+from hal.validation import StrictTable
 
 RAMP_TICKS = 20
 """Ticks from the decision to neutral: 20 ms. The amplifier's own ramp is shorter, so that steps can be retried."""
@@ -49,7 +50,7 @@ Temperature_C = Annotated[float, Field(ge=-100.0, le=200.0)]
 Supply_V = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
-class SafetyLimits(BaseModel):
+class SafetyLimits(StrictTable):
     """Sets the limits beyond which the outputs leave normal operation.
 
     ``stale_ms``: the DAQ may be silent for so long. ``temperature_C`` and ``supply_V``: the lowest and the highest
@@ -66,8 +67,6 @@ class SafetyLimits(BaseModel):
     ``holds_per_minute``: one more within a minute ends the run; with 0 every finding does.
     ``rearm``: who ends a hold whose cause has passed, the firmware or a person (button of the page, key, SIGUSR1).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     stale_ms: Time_ms = 5.0
     temperature_C: tuple[Temperature_C, Temperature_C] = (0.0, 60.0)
@@ -93,13 +92,11 @@ class SafetyLimits(BaseModel):
         return limits
 
 
-class SelfTestLimits(BaseModel):
+class SelfTestLimits(StrictTable):
     """Sets how long the sensors must be good without interruption before arming, and the time limit of the self-test.
 
     ``watch_ms``: required time without interruption. ``limit_ms``: a self-test that takes longer trips.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     watch_ms: float = Field(default=500.0, ge=50.0, le=10_000.0)
     limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)

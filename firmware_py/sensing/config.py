@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hal.plugins import ATTITUDE, offered
-from hal.validation import NotNegative, Positive, validate_table
+from hal.validation import NotNegative, Positive, StrictTable, validate_table
 
 Vector = tuple[float, float, float]
 Pair = tuple[float, float]
@@ -50,15 +50,13 @@ def attitude_methods() -> tuple[str, ...]:
     return (DEFAULT_METHOD, *sorted(offered(ATTITUDE)))
 
 
-class SensingConfig(BaseModel):
+class SensingConfig(StrictTable):
     """Sets sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (Ang 2004 (2.34)), then
     more.
 
     With seven or eight axes, ``channels``, ``positions_m`` and ``axes`` name them; supply and temperature give up
     inputs.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     tick_hz: Positive = 1000.0
     lsb_V: Positive = 10.0 / 65536.0

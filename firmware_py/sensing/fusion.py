@@ -8,26 +8,25 @@ from math import asin, atan2, degrees
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from firmware_py.records import Array, Record, new
 from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope, step_gyroscope
 from hal.errors import BenchError
 from hal.plugins import FUSION, load, offered
+from hal.validation import StrictTable
 
 ALIGN_S = 0.1
 METHODS = ("error-state", "vqf")
 """Built-in filters. A source tree offers those of Erat 2018, too (``tools.research.endoscope.published_filters``)."""
 
 
-class FusionConfig(BaseModel):
+class FusionConfig(StrictTable):
     """Selects the filter and its parameters. The defaults are Erat 2018's printed choice (sections 3.3, 3.4).
 
     ``error-state`` is the Kalman filter of ``error_state.py``: it finds the gyroscope's bias and needs force in m/s^2.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: str = "error-state"
     tau_s: float = Field(default=0.1, gt=0.0)

@@ -8,12 +8,12 @@ from math import inf, sqrt
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from firmware_py.tremor.detector_config import DetectorConfig
 from hal.plugins import ESTIMATORS, offered
 from hal.types import STANDARD_GRAVITY
-from hal.validation import NotNegative, Positive, validate_table
+from hal.validation import NotNegative, Positive, StrictTable, validate_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Edge = tuple[Positive, Positive]
@@ -40,11 +40,7 @@ def why_unknown(method: str) -> str:
     return f"'{method}' is no estimator; there are: {', '.join(all_methods())}"
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class WflcConfig(_Table):
+class WflcConfig(StrictTable):
     """Weighted-frequency Fourier linear combiner and the combiner that trails it (Ang 2004, 5.2).
 
     Gains belong to a signal of unit power: the input is normalised by its own (erratum 56).
@@ -90,7 +86,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 """Settings of the adaptive method by the name that a bench gives in ``preset``. Keys beside it override them."""
 
 
-class AdaptiveConfig(_Table):
+class AdaptiveConfig(StrictTable):
     """Causal linear filter learned from the hand itself (firmware_py/tremor/adaptive.py).
 
     ``preset`` names settings that are the start (``PRESETS``). ``memory_s`` is how long the hand is remembered,
@@ -199,7 +195,7 @@ class AdaptiveConfig(_Table):
         return self
 
 
-class LeverConfig(_Table):
+class LeverConfig(StrictTable):
     """Holds what the instrument knows of its own turning (``firmware_py.sensing.quiet_point``).
 
     Accelerometers know the acceleration of one point best; from there to the tip the noise of the angular acceleration
@@ -227,7 +223,7 @@ class LeverConfig(_Table):
         return self.tip_noise_m_s2_rtHz[axis] if self.noise is None else sqrt(self.noise[axis][axis])
 
 
-class TremorConfig(_Table):
+class TremorConfig(StrictTable):
     """Estimator, its horizon, what it sees and when it counts as settled.
 
     ``sees`` acceleration: samples in m/s^2 of the tip behind the RC filter of ``filter_cutoff_rad_s``. displacement:

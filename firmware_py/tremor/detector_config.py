@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
-
-from hal.validation import Positive
+from hal.validation import Positive, StrictTable
 
 
-class DetectorConfig(BaseModel):
+class DetectorConfig(StrictTable):
     """Bands and limits of chi-squared for slow and brisk jerks, how much acceleration may be left over.
 
     With three degrees of freedom the limits give less than one false alarm in ten minutes (test_detectors.py).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     slow_hz: tuple[Positive, Positive] = (1.8, 6.0)
     brisk_hz: tuple[Positive, Positive] = (15.0, 45.0)

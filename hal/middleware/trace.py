@@ -56,12 +56,26 @@ class _Log:
         self._sink.write(f"{now_ns - self._start_ns} {text}\n")
 
 
-class TraceSerial:
+class _Traced:
+    """Passes on what leaves no line."""
+
+    def __init__(self, below: SerialPort | I2cBus | CanBus, clock: Clock, kind: str, sink: TextIO) -> None:
+        self._below = below
+        self._log = _Log(sink, clock, kind, below.info().uri)
+
+    def info(self) -> PortInfo:
+        return self._below.info()
+
+    def close(self) -> None:
+        self._below.close()
+
+
+class TraceSerial(_Traced):
     """SerialPort that writes its transcript to ``sink`` (the caller opens and closes it)."""
 
     def __init__(self, port: SerialPort, clock: Clock, sink: TextIO) -> None:
+        super().__init__(port, clock, "serial", sink)
         self._port = port
-        self._log = _Log(sink, clock, "serial", port.info().uri)
 
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         n = self._port.read_into(buf, timeout_s)
@@ -76,19 +90,13 @@ class TraceSerial:
     def drain_input(self) -> int:
         return self._port.drain_input()
 
-    def info(self) -> PortInfo:
-        return self._port.info()
 
-    def close(self) -> None:
-        self._port.close()
-
-
-class TraceI2c:
+class TraceI2c(_Traced):
     """I2cBus that writes its transcript to ``sink``, failures included."""
 
     def __init__(self, bus: I2cBus, clock: Clock, sink: TextIO) -> None:
+        super().__init__(bus, clock, "i2c", sink)
         self._bus = bus
-        self._log = _Log(sink, clock, "i2c", bus.info().uri)
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         try:
@@ -108,19 +116,13 @@ class TraceI2c:
         self._log(f"x {address:02x} {' '.join(words)}")
         return result
 
-    def info(self) -> PortInfo:
-        return self._bus.info()
 
-    def close(self) -> None:
-        self._bus.close()
-
-
-class TraceCan:
+class TraceCan(_Traced):
     """CanBus that writes its transcript to ``sink``."""
 
     def __init__(self, bus: CanBus, clock: Clock, sink: TextIO) -> None:
+        super().__init__(bus, clock, "can", sink)
         self._bus = bus
-        self._log = _Log(sink, clock, "can", bus.info().uri)
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
         self._bus.send(frame, timeout_s)
@@ -134,12 +136,6 @@ class TraceCan:
 
     def stats(self) -> CanStats:
         return self._bus.stats()
-
-    def info(self) -> PortInfo:
-        return self._bus.info()
-
-    def close(self) -> None:
-        self._bus.close()
 
 
 def _frame(frame: CanFrame) -> str:

@@ -7,21 +7,19 @@ from dataclasses import replace
 
 from hal.contracts import CanBus, Clock
 from hal.errors import BusError
-from hal.middleware.faults.plan import FaultPlan, Injector, marked
-from hal.types import CanFrame, CanStats, PortInfo
+from hal.middleware.faults.plan import FaultPlan, FaultyPort
+from hal.types import CanFrame, CanStats
 
 BABBLE_ID = 0x001
 
 
-class FaultCan:
+class FaultCan(FaultyPort):
     """Injects faults into a CanBus. A corrupted frame arrives; only its own checksum can reveal it."""
 
     def __init__(self, bus: CanBus, clock: Clock, plan: FaultPlan) -> None:
+        super().__init__(bus, clock, plan)
         self._bus = bus
-        self._clock = clock
-        self._faults = Injector(plan, clock, bus.info().uri)
         self._waiting: deque[CanFrame] = deque()
-        self.counts = self._faults.counts
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
         faults = self._faults
@@ -80,13 +78,3 @@ class FaultCan:
         below = self._bus.stats()
         errors = below.error_frames + self.counts.error_frames
         return CanStats(below.rx, below.tx, below.dropped + self.counts.lost, errors)
-
-    def arm(self, plan: FaultPlan) -> None:
-        """Begin ``plan`` now, instead of the one before; the counts go on."""
-        self._faults.begin(plan)
-
-    def info(self) -> PortInfo:
-        return marked(self._bus.info())
-
-    def close(self) -> None:
-        self._bus.close()

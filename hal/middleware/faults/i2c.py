@@ -6,21 +6,20 @@ from collections.abc import Sequence
 
 from hal.contracts import Clock, I2cBus
 from hal.errors import ErrorKind, I2cNack
-from hal.middleware.faults.plan import FaultPlan, Injector, marked
-from hal.types import I2cOp, I2cWrite, PortInfo
+from hal.middleware.faults.plan import FaultPlan, FaultyPort
+from hal.types import I2cOp, I2cWrite
 
 
-class FaultI2c:
+class FaultI2c(FaultyPort):
     """Injects faults into an I2cBus. A silent bus acknowledges nothing; a lost transfer is an address NACK, too.
 
     ``only`` restricts everything but disconnection to one device address.
     """
 
     def __init__(self, bus: I2cBus, clock: Clock, plan: FaultPlan, *, only: int | None = None) -> None:
+        super().__init__(bus, clock, plan)
         self._bus = bus
         self._only = only
-        self._faults = Injector(plan, clock, bus.info().uri)
-        self.counts = self._faults.counts
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         faults, plan = self._faults, self._faults.plan
@@ -59,12 +58,6 @@ class FaultI2c:
         return damaged
 
     def arm(self, plan: FaultPlan, *, only: int | None = None) -> None:
-        """Begin ``plan`` now, instead of the one before; the counts go on."""
+        """See ``FaultyPort.arm``."""
         self._only = only
-        self._faults.begin(plan)
-
-    def info(self) -> PortInfo:
-        return marked(self._bus.info())
-
-    def close(self) -> None:
-        self._bus.close()
+        super().arm(plan)

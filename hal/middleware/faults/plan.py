@@ -10,7 +10,7 @@ import math
 import random
 from dataclasses import dataclass, replace
 
-from hal.contracts import Clock
+from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import Disconnected, HalTimeout
 from hal.types import PortInfo
 
@@ -136,6 +136,23 @@ class Injector:
         return max(0, int((self.now_s() - self.plan.from_s) * rate_hz) - done)
 
 
-def marked(info: PortInfo) -> PortInfo:
-    """Reports must say that a port is being sabotaged."""
-    return replace(info, description=f"{info.description}, with injected faults")
+class FaultyPort:
+    """Injects the faults of a plan into a port or bus. ``counts`` says which were injected."""
+
+    def __init__(self, below: SerialPort | I2cBus | CanBus, clock: Clock, plan: FaultPlan) -> None:
+        self._below = below
+        self._clock = clock
+        self._faults = Injector(plan, clock, below.info().uri)
+        self.counts = self._faults.counts
+
+    def arm(self, plan: FaultPlan) -> None:
+        """Begin ``plan`` now, instead of the one before; the counts go on."""
+        self._faults.begin(plan)
+
+    def info(self) -> PortInfo:
+        """Reports must say that a port is being sabotaged."""
+        info = self._below.info()
+        return replace(info, description=f"{info.description}, with injected faults")
+
+    def close(self) -> None:
+        self._below.close()

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from hal.contracts import Clock, SerialPort
-from hal.middleware.faults.plan import FaultPlan, Injector, marked
-from hal.types import PortInfo
+from hal.middleware.faults.plan import FaultPlan, FaultyPort
 
 
-class FaultSerial:
-    """Injects faults into a SerialPort. ``counts`` says which were injected."""
+class FaultSerial(FaultyPort):
+    """Injects faults into a SerialPort."""
 
     def __init__(self, port: SerialPort, clock: Clock, plan: FaultPlan) -> None:
+        super().__init__(port, clock, plan)
         self._port = port
-        self._clock = clock
-        self._faults = Injector(plan, clock, port.info().uri)
         self._held = b""  # bytes that were read from the port and are not delivered yet
-        self.counts = self._faults.counts
 
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         faults = self._faults
@@ -88,13 +85,3 @@ class FaultSerial:
         dropped = len(self._held)
         self._held = b""
         return dropped + self._port.drain_input()
-
-    def arm(self, plan: FaultPlan) -> None:
-        """Begin ``plan`` now, instead of the one before; the counts go on."""
-        self._faults.begin(plan)
-
-    def info(self) -> PortInfo:
-        return marked(self._port.info())
-
-    def close(self) -> None:
-        self._port.close()

@@ -19,10 +19,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from firmware_py.endoscope.control import INACTIVE, MOVE, ZOOM, View
 from firmware_py.endoscope.targets import GameState
+from hal.validation import StrictTable
 
 Phase = Literal["look", "return", "press", "steer", "stop"]
 Pair = tuple[float, float]
@@ -33,10 +34,8 @@ SEE_S = 0.15
 REST_LAGS = 5.0
 
 
-class UserConfig(BaseModel):
+class UserConfig(StrictTable):
     """Describes a person. Times in s, angles in deg."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = "user"
     seed: int = Field(default=1, ge=0)

@@ -6,18 +6,16 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from hal.validation import describe_validation_error
+from hal.validation import StrictTable, describe_validation_error
 from tools.errors import InputError
 
 Vector = tuple[float, float, float]
 
 
-class Box(BaseModel):
+class Box(StrictTable):
     """A box in the body frame, mm; a side of length zero makes it a plate, a line or a point."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     low_mm: Vector
@@ -30,10 +28,8 @@ class Box(BaseModel):
         return self
 
 
-class Space(BaseModel):
+class Space(StrictTable):
     """``SPACE.toml``. ``packages`` of ``axes_per_package`` axes each; a dual-axis package's axes are orthogonal."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal[1]
     title: str = "accelerometers"

@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from firmware_py.sensing.translation import integrator_sections
 from firmware_py.tremor.adaptive_design import sensor_response
@@ -21,7 +21,7 @@ from firmware_py.tremor.own import OwnEstimator
 from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
 from hal.compiled import kernel
 from hal.errors import BenchError
-from hal.validation import Positive, validate_table
+from hal.validation import Positive, StrictTable, validate_table
 
 Array = NDArray[np.float64]
 OUTPUTS = 2
@@ -32,10 +32,8 @@ SCALARS = 9
 FIXED = 2 + 2 * SECTIONS  # numbers in the memory in front of what depends on the order
 
 
-class ArConfig(BaseModel):
+class ArConfig(StrictTable):
     """Direct multi-step autoregressive predictor, its coefficients tracked by a Kalman filter (Tatinati, Ang 2013)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     order: Annotated[int, Field(ge=2, le=12)] = 6
     spacing_s: Positive = 0.01

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
@@ -21,7 +21,7 @@ from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sec
 from firmware_py.tremor.seen import seen_params, undo
 from hal.compiled import kernel
 from hal.errors import BenchError
-from hal.validation import Positive, validate_table
+from hal.validation import Positive, StrictTable, validate_table
 
 Array = NDArray[np.float64]
 FOLLOW_TICKS = 50  # the band of E-BMFLC moves this often
@@ -30,7 +30,7 @@ MOST = 29
 """Largest comb that fits into the memory."""
 
 
-class BmflcConfig(BaseModel):
+class BmflcConfig(StrictTable):
     """Band-limited multiple Fourier linear combiner in its three forms (Veluvolu, Ang 2011).
 
     ``memory_s`` is the window of E-BMFLC, ``memory_gain`` its gain; its band follows the centroid of the weights by
@@ -38,8 +38,6 @@ class BmflcConfig(BaseModel):
     ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise, ``bias_walk``
     that of the bias weight.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     low_hz: Positive = 7.0
     high_hz: Positive = 13.0

@@ -19,14 +19,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
 from scipy import linalg as scipy_linalg  # pyright: ignore[reportMissingTypeStubs]
 
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
 from hal.compiled import kernel
 from hal.errors import BenchError
-from hal.validation import Positive, validate_table
+from hal.validation import Positive, StrictTable, validate_table
 
 Matrix = NDArray[np.float64]
 linalg: Any = scipy_linalg  # without type stubs
@@ -35,13 +34,11 @@ MEMORY, NUMBERS = 128, 1024
 FIRST = 3  # numbers in front of the rows: modes, drift, observe
 
 
-class KalmanConfig(BaseModel):
+class KalmanConfig(StrictTable):
     """Tremor as a sum of narrow-band oscillators, sensor noise and drift, all seen through the RC filter.
 
     The gain depends only on ratios, so ``tremor_rms_m`` is the size the filter is best at, not a limit.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     frequencies_hz: tuple[Positive, ...] = (8.5, 9.2, 10.0, 10.8, 11.5)
     bandwidth_hz: Positive = 0.8
