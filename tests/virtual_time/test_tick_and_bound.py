@@ -2,21 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
+from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
+from firmware_py.tremor.config import TremorConfig
 from tests.conftest import DEFAULT_BENCH
 from tools.research.tremor.bench_variant import merged, write_variant
-from tools.research.tremor.ideal import SETTLE_S, ideal_changes, left_and_bound
+from tools.research.tremor.bound import bank_features, lift
+from tools.research.tremor.cases import RATE_HZ
+from tools.research.tremor.ideal import (
+    EVERY,
+    LOOP_DELAY_S,
+    SETTLE_S,
+    ideal_changes,
+    ideal_samples,
+    involuntary,
+    wanted_motion,
+)
 
+Array = NDArray[np.float64]
 SECONDS = 20.0
 SAMPLE_TO_STROKE_S = 0.6e-3
 """Sample to command over the emulated wires (0.5 ms) and the amplifier's lag (0.1 ms), at any tick rate."""
+
+
+def left_and_bound(truth: Mapping[str, Array], keep: NDArray[np.bool_], delay_s: float) -> tuple[float, float]:
+    """Return the lifted residuals (m rms) of a run with accelerometer noise and of the bound at exactly ``delay_s``,
+    over the rows ``keep`` (n,).
+
+    The bound looks at every sample of the truth (1000 Hz), whatever the tick of the run.
+    """
+    design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
+    samples, wanted = ideal_samples(truth, noise=True), wanted_motion(truth)
+    t_s = np.arange(len(wanted)) / RATE_HZ
+    rows = np.flatnonzero(keep)[::EVERY]
+    unpredicted = np.empty_like(wanted)
+    for i in range(3):
+        then = np.interp(t_s + delay_s, t_s, wanted[:, i])
+        plain = bank_features(samples[:, i], design)
+        features, goal = lift(plain, design)[rows], lift(then, design)[rows]
+        unpredicted[:, i] = then - plain @ solve_scaled(features.T @ features, (features.T @ goal)[None, :])[0]
+    error = involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"]))
+    left, bound = (float(np.sqrt(np.mean(np.sum(lift(x, design)[keep] ** 2, axis=1)))) for x in (error, unpredicted))
+    return left, bound
 
 
 def left_over_bound(tick_hz: int, seed: int, folder: Path) -> float:

@@ -19,7 +19,6 @@ from numpy.lib import format as npy
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import new_file, new_folder, refuse_existing
-from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
 from tools.formats import mdf, netcdf, parquet, view
 from tools.toml_text import toml_text
@@ -134,7 +133,7 @@ def _npz(recording: Recording, path: Path) -> None:
             npy.write_array_header_1_0(file, header)
         for block in recording.blocks():
             for file, column in zip(files, block.data, strict=True):
-                file.write(_little_endian(column))
+                file.write(column.astype("<f8", copy=False).tobytes())
     finally:
         for file in files:
             file.close()
@@ -142,10 +141,6 @@ def _npz(recording: Recording, path: Path) -> None:
         for i, name in enumerate(recording.names):
             archive.write(parts / str(i), f"{name}.npy")
     shutil.rmtree(parts)
-
-
-def _little_endian(column: Float64Array) -> bytes:
-    return column.astype("<f8", copy=False).tobytes()
 
 
 @dataclass(frozen=True, slots=True)

@@ -191,12 +191,9 @@ def _since(unit: str) -> float | None:
 
 
 def _longest(file: Any) -> str:
-    sizes = {str(d): n for d, n in file.sizes.items() if any(d in v.dims and _is_numeric(v) for v in _all(file))}
+    of_numbers = [v for v in file.variables.values() if _is_numeric(v)]
+    sizes = {str(d): n for d, n in file.sizes.items() if any(d in v.dims for v in of_numbers)}
     return max(sizes, key=lambda d: sizes[d]) if sizes else ""
-
-
-def _all(file: Any) -> list[Any]:
-    return [file.variables[name] for name in file.variables]
 
 
 def _is_numeric(variable: Any) -> bool:

@@ -134,7 +134,7 @@ def write(recording: Recording, path: Path) -> View:
     listed = topics(recording.columns)
     names = recording.names
     clock = names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in names else None
-    numbers = None if clock is not None else recording.row_numbers()
+    numbers = recording.row_numbers() if clock is None else np.zeros(0)
     with path.open("wb") as file:
         out = _Writer(file)
         tables = [
@@ -151,7 +151,7 @@ def write(recording: Recording, path: Path) -> View:
         waiting.sort(key=lambda pair: pair[0])
         last_ns = 0
         for start, rows in batches(recording, _ROWS // fmt.BLOCK_ROWS):
-            t_s = rows[clock] if clock is not None else _slice(numbers, start, rows.shape[1]) / recording.tick_hz
+            t_s = rows[clock] if clock is not None else numbers[start : start + rows.shape[1]] / recording.tick_hz
             t_ns = _times(t_s, last_ns)
             last_ns = int(t_ns[-1])
             parts = [out.rows(channel, make(rows[columns], t_ns), t_ns, start) for channel, make, columns in tables]
@@ -162,10 +162,6 @@ def write(recording: Recording, path: Path) -> View:
             out.chunk([], [(events, *e) for e in waiting])
         out.finish()
         return View(tuple(out.topics), out.messages)
-
-
-def _slice(numbers: Any, start: int, count: int) -> Any:
-    return numbers[start : start + count]
 
 
 def _texts(recording: Recording) -> dict[str, str]:

@@ -6,14 +6,13 @@ Each part is compared on a recording of its own before anything is identified; t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from firmware_py.actuation.config import StackConfig
 from firmware_py.actuation.manipulator import star_tip
 from firmware_py.control.plan import load_plan
 from hal.bench import BenchFile
@@ -83,10 +82,6 @@ class Part:
     identify: Callable[[Lab], Path]
 
 
-def _stack_configs(bench: BenchFile) -> Sequence[StackConfig]:
-    return load_plan(bench).stages.actuation.stacks
-
-
 def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: float, volts: float) -> dict[str, Any]:
     twin = in_place(lab.config, lab.bench.path, axis, None)
     return measure_piezo(lab.config, axis, profile, rate_hz, seconds, volts, twin=twin)[0]
@@ -95,7 +90,7 @@ def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: 
 def compare_stacks(lab: Lab) -> Comparison:
     """Compare each stack with the firmware's model of it, about the mean of both, and return the worst."""
     worst: tuple[float, Recording, int] | None = None
-    for axis, believed in enumerate(_stack_configs(lab.bench)):
+    for axis, believed in enumerate(load_plan(lab.bench).stages.actuation.stacks):
         parts = [_measured_stack(lab, axis, p, hz, CHECK_S, AMPLITUDE_V) for p, hz in PROFILES]
         predicted = [predict_stroke(believed, p["command_V"]) for p in parts]
         for part, modelled in zip(parts, predicted, strict=True):

@@ -300,7 +300,7 @@ class _Module:
         self._base()
         outputs = ", ".join(f'"{o}": {_name(o)}' for o in self.twin.outputs)
         opaque = isinstance(self.twin, OpaqueTwin)
-        lines = [*self._head(), "", *self._imports(), "", *self._parameters(), ""]
+        lines = [*self._head(), "", "import numpy as np", "", *self._parameters(), ""]
         lines += [line for name in _order(w.used) for line in ("", *SOURCES[name].splitlines(), "")]
         lines += ["", "def twin(p, dt, base):" if opaque else "def twin(p, dt):"]
         lines += [
@@ -312,9 +312,6 @@ class _Module:
         lines += [f"        return {{{outputs}}}", "", "    return run", "", ""]
         lines += self._simulate(opaque)
         return "\n".join(lines) + "\n"
-
-    def _imports(self) -> list[str]:
-        return ["import numpy as np"]
 
     def _head(self) -> list[str]:
         rec = self.recording

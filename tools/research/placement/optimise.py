@@ -9,7 +9,6 @@ soft walls, then as hard ones, and a result that breaks them is not taken.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -74,10 +73,6 @@ class Optimum:
     cost: float
 
 
-def _assignments(space: Space) -> Iterator[tuple[int, ...]]:
-    yield from combinations_with_replacement(range(len(space.box)), space.packages)
-
-
 def optimise(space: Space, seed: int = 0) -> Optimum:
     """The best placement found; deterministic for a seed. Raises ValueError when none is observable."""
     from tools.research.placement.variance import angular_noise
@@ -129,7 +124,7 @@ def optimise(space: Space, seed: int = 0) -> Optimum:
         )
         return value, gradient
 
-    for boxes in _assignments(space):
+    for boxes in combinations_with_replacement(range(len(space.box)), space.packages):
         low = np.array([space.box[b].low_mm for b in boxes]) * 1e-3 / LENGTH_M
         high = np.array([space.box[b].high_mm for b in boxes]) * 1e-3 / LENGTH_M
         starts = []

@@ -23,6 +23,7 @@ from sim_devices.plant.lab import measure_tumble
 from tools.calibrate.tumble import identify
 from tools.research.reproduce.rows import Row
 from tools.research.reproduce.scene import SceneResult, run_scene
+from tools.research.reproduce.sensing_static import drawing
 
 Array = NDArray[np.float64]
 BAND_HZ = (8.0, 12.0)
@@ -91,11 +92,8 @@ def variant(on: set[str]) -> EmulationConfig:
 
 def calibrated_config(config: EmulationConfig) -> SensingConfig:
     """Return what the firmware knows after a tumble of this unit."""
-    places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
     table = identify(measure_tumble(config, 100, 5.0)[0]).table
-    return SensingConfig.model_validate(
-        {"positions_m": places, "gravity_m_s2": config.environment.gravity_m_s2} | table
-    )
+    return SensingConfig.model_validate(drawing(config) | table)
 
 
 def _band(signal: Array, cutoff_rad_s: float | None = None) -> Array:

@@ -22,7 +22,7 @@ from tools.research.placement.configurations import Placement
 from tools.research.placement.variance import motion_covariance
 from tools.research.reproduce.rows import Row
 from tools.research.reproduce.scene import SceneResult, run_scene
-from tools.research.reproduce.sensing_static import UNITS, calibrated
+from tools.research.reproduce.sensing_static import UNITS, calibrated, drawing
 from tools.research.tremor.ideal import PERFECT_EMULATION
 
 Array = NDArray[np.float64]
@@ -35,8 +35,7 @@ IDEAL = SensorConfig(
 
 def nominal(config: EmulationConfig) -> SensingConfig:
     """The firmware told of the instrument's drawing, no calibration."""
-    places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
-    return SensingConfig.model_validate({"positions_m": places, "gravity_m_s2": config.environment.gravity_m_s2})
+    return SensingConfig.model_validate(drawing(config))
 
 
 def tilt_and_heading_deg(result: SceneResult) -> tuple[Array, Array]:

@@ -92,15 +92,20 @@ def _towards(axis: Array) -> Array:
     return np.stack([x, np.cross(axis, x), axis])
 
 
+def drawing(config: EmulationConfig) -> dict[str, Any]:
+    """Return the keys that tell the firmware of the drawing of the instrument and of its place."""
+    places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
+    return {"positions_m": places, "gravity_m_s2": config.environment.gravity_m_s2}
+
+
 @cache
 def calibrated(large: bool, unit: int) -> Calibrated:
     """Return the calibrations of a unit."""
     config = _config(LARGE if large else DEFAULT, unit)
-    places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
-    gravity = config.environment.gravity_m_s2
-    common = {"positions_m": places, "gravity_m_s2": gravity}
+    common = drawing(config)
     poses = measure_tumble(config, 100, 5.0)[0]
-    design = np.column_stack([gravity * poses["attitude"][:, 2, :], np.ones(len(poses["attitude"]))])
+    up = common["gravity_m_s2"] * poses["attitude"][:, 2, :]
+    design = np.column_stack([up, np.ones(len(up))])
     return Calibrated(
         config,
         SensingConfig(**common, **maker_line(config)),

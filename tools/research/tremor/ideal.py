@@ -114,7 +114,7 @@ def ideal_run(bench: Path, seconds: float, noise: bool, seed: int | None = None)
 def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> tuple[float, float, float]:
     """Lifted residual (m rms) of the run, of the estimator alone and of the bound over the rows ``keep``."""
     design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
-    samples, wanted = _samples(truth, noise), _wanted(truth)
+    samples, wanted = ideal_samples(truth, noise), wanted_motion(truth)
     left = (
         involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"])),
         _alone(samples, wanted, noise),
@@ -130,35 +130,15 @@ def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> Array
     Fitted over the rows ``keep``, lifted, at ``LOOP_DELAY_S``, to the tip's acceleration behind the sensor's filter,
     with the sensors' noise.
     """
-    return _bound(_samples(truth, noise=True), _wanted(truth), keep)
+    return _bound(ideal_samples(truth, noise=True), wanted_motion(truth), keep)
 
 
-def left_and_bound(truth: Mapping[str, Array], keep: NDArray[np.bool_], delay_s: float) -> tuple[float, float]:
-    """Return the lifted residuals (m rms) of a run with accelerometer noise and of the bound at exactly ``delay_s``,
-    over the rows ``keep`` (n,).
-
-    The bound looks at every sample of the truth (1000 Hz), whatever the tick of the run.
-    """
-    design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
-    samples, wanted = _samples(truth, noise=True), _wanted(truth)
-    t_s = np.arange(len(wanted)) / RATE_HZ
-    rows = np.flatnonzero(keep)[::EVERY]
-    unpredicted = np.empty_like(wanted)
-    for i in range(3):
-        then = np.interp(t_s + delay_s, t_s, wanted[:, i])
-        plain = bank_features(samples[:, i], design)
-        features, goal = lift(plain, design)[rows], lift(then, design)[rows]
-        unpredicted[:, i] = then - plain @ solve_scaled(features.T @ features, (features.T @ goal)[None, :])[0]
-    error = involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"]))
-    left, bound = (float(np.sqrt(np.mean(np.sum(lift(x, design)[keep] ** 2, axis=1)))) for x in (error, unpredicted))
-    return left, bound
-
-
-def _wanted(truth: Mapping[str, Array]) -> Array:
+def wanted_motion(truth: Mapping[str, Array]) -> Array:
+    """(n, 3) m: the involuntary motion of the tip with the manipulator at rest."""
     return involuntary(np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"]))
 
 
-def _samples(truth: Mapping[str, Array], noise: bool) -> Array:
+def ideal_samples(truth: Mapping[str, Array], noise: bool) -> Array:
     """(n, 3) m/s^2: the tip's own acceleration as an ideal instrument would see it."""
     rigid = np.asarray(truth["tip_rigid_m"])
     samples = np.zeros_like(rigid)
