@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.row import Row, cpu_us, side_by_side
 from firmware_py.sensing.fusion import Fusion, FusionConfig
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 RATE_HZ = 286.0
 N = 20_000
 SLOW_N = 1000

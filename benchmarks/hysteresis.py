@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import step_input
 from benchmarks.row import Row, side_by_side
 from firmware_py.actuation.hysteresis import drive, stack_stroke
 from firmware_py.records import Record, attributes
+from hal.arrays import Array
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
 N = 20_000
 NUMPY_N = 2000
 

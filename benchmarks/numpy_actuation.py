@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.frame import LAYOUT
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 AT = {column.name: column.start if column.size == 1 else column.span for column in LAYOUT}
 
 

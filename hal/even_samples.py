@@ -7,9 +7,8 @@ noise of them: twice the power above 20 Hz in the mouse recordings of ``../share
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 SMOOTH_S = 2.0  # a crystal does not change its rate within this; a transport jitters far faster
 

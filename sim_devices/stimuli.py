@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.faces import VoltageSource, Volts
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
 
-Array = NDArray[np.float64]
 Source = Callable[[int], float]  # bench time in ns -> value
 AXES = ("ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "temperature")
 MOTION_UNITS = dict(zip(AXES, ("m/s^2",) * 3 + ("rad/s",) * 3 + ("uT",) * 3 + ("degC",), strict=True))

@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Complex = NDArray[np.complex128]
 Answer = Callable[[Array], Complex]
 """(n,) complex gain from demands that are held for a tick to the stroke, at (n,) Hz; 1 at rest."""

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.manipulator import tip_from_strokes, tip_jacobian
 from firmware_py.records import Record
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_index, scratch_matrix
-
-Array = NDArray[np.float64]
 
 # Gauss-Newton steps: each leaves about distance / shaft length of the last (a percent for half a millimetre)
 REACH_PASSES = 4

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.tremor.config import AdaptiveConfig, LeverConfig, TremorConfig
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GRID_STEP_HZ = 0.02

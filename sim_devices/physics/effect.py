@@ -21,7 +21,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Settings = Mapping[str, tuple[float, ...]]
 """Frozen, data-derived numbers of one placed effect. Scalars are 1-tuples."""
 

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
-
-Array = NDArray[np.float64]
 
 
 def _zeros() -> Array:

@@ -28,8 +28,8 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand_kernel import (
     DRIFT,
@@ -45,8 +45,6 @@ from sim_devices.plant.hand_kernel import (
 )
 from sim_devices.plant.smooth_noise import smooth_noise
 from sim_devices.plant.streams import stream
-
-Array = NDArray[np.float64]
 
 NODE_S = 1e-3
 """A hand is given by nodes this far apart."""

@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.errors import BenchError
 from hal.even_samples import evenly
 from hal.npz import open_npz
 from sim_devices.plant.sensors import STANDARD_GRAVITY
-
-Array = NDArray[np.float64]
 
 _UNITS = {
     "g": ("acceleration", STANDARD_GRAVITY),

@@ -15,14 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
 from sim_devices.plant.sensors import STANDARD_GRAVITY, rc_weights
 from sim_devices.plant.streams import stream
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 REFERENCE_C = 25.0

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.body_motion import BodyMotion
 from sim_devices.plant.hand import Hand
@@ -28,8 +29,6 @@ from sim_devices.plant.more_axes import MoreAxes
 from sim_devices.plant.stack_twin import StackTwins, move_tips
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
-
-Array = NDArray[np.float64]
 
 BLOCK_MS = 16
 _BLOCK_STEPS = BLOCK_MS * STEPS_PER_MS

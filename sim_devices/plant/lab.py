@@ -21,9 +21,9 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.validation import describe_validation_error
@@ -36,8 +36,6 @@ from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays, start_temperature_C
 from sim_devices.twin_file import FileTwin, load_twin
-
-Array = NDArray[np.float64]
 
 INTERFEROMETER_RMS_UM = 0.07
 RATE_HZ = 1000.0

@@ -7,8 +7,8 @@ is the turn's; swings of up to 35 degrees about all axes with several frequencie
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig
@@ -18,7 +18,6 @@ from sim_devices.plant.sensors import sensor_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
 
-Array = NDArray[np.float64]
 LSB_V = 10.0 / 65536.0
 ADC_V = 187.5e-6  # ADS1115 at +-6.144 V
 ADC_EVERY = 10

@@ -9,15 +9,13 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import STEP_S
 from sim_devices.plant.manipulator import take_up, tip_displacement
 from sim_devices.plant.stack import drive_channel, drive_step
 from sim_devices.plant.unit import build_unit, start_temperature_C
-
-Array = NDArray[np.float64]
 
 TRACKER_RMS_UM = 0.7
 """Noise of one sample and axis of the optical reference that the authors of source Latt 2011 used."""

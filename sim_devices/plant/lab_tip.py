@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import STEP_S
 from sim_devices.plant.lab import drive_stack
@@ -19,8 +19,6 @@ from sim_devices.plant.manipulator import take_up, tip_displacement
 from sim_devices.plant.stack import drive_channel
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, start_temperature_C
-
-Array = NDArray[np.float64]
 
 SWINGS_HZ = (0.23, 0.31, 0.41)
 AMPLITUDE_V = 40.0

@@ -10,14 +10,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import MoreAxis, SensorConfig
 from sim_devices.plant.body_motion import BodyMotion
 from sim_devices.plant.sensors import STANDARD_GRAVITY, rc_weights
 from sim_devices.plant.streams import stream
 
-Array = NDArray[np.float64]
 SUPPLY_INPUT = 6  # half the supply, before that input is given up
 
 

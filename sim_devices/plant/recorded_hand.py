@@ -20,13 +20,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from sim_devices.plant.hand_file import HandFileError, HandRecording, load_hand
 from sim_devices.plant.hand_kernel import between, pose_between
-
-Array = NDArray[np.float64]
 
 TREMOR_BAND_HZ = (8.0, 12.0)
 _NODES_HZ = 250.0

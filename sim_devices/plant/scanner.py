@@ -15,12 +15,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig, EndoscopeConfig
 from sim_devices.plant.body_motion import BodyMotion
 from sim_devices.plant.rigid_body import attitude, body_rates, quaternion
 from sim_devices.plant.streams import stream
 
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array, Array, Array]
 """Angles (roll, pitch, yaw) rad with first and second derivative, and acceleration of the origin in the world."""
 

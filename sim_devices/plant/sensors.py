@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.config import EnvironmentConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.streams import stream
-
-Array = NDArray[np.float64]
 
 LOCATION = (0, 0, 1, 1, 2, 2)
 DIRECTION = (0, 2, 1, 2, 0, 1)

@@ -13,10 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 CORRELATION_POLE = 2.904
 """L times the 1/e correlation time."""

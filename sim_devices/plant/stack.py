@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.config import AmplifierConfig, StackConfig
 from sim_devices.plant.streams import stream
-
-Array = NDArray[np.float64]
 
 SLIPS = 12
 REFERENCE_C = 25.0

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.plant.manipulator import take_up, tip_displacement
 
 if TYPE_CHECKING:
     from sim_devices.twin_file import FileTwin
-
-Array = NDArray[np.float64]
 
 MS_S = 1e-3
 

@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.calibrate.multi_position import Estimate, estimates_of, missing_poses
 from tools.errors import InputError
 from tools.numbers import rms
 
-Array = NDArray[np.float64]
 NAMES = ("bias_V", "s_x", "s_y", "s_z", "in_plane_2", "out_of_plane_2", "scale_1", "scale_2")
 DRIFT = "drift_V"
 LARGEST_CONDITION = 100.0

@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from hal.arrays import Array
 from tools.calibrate.multi_position import Estimate, estimates_of, missing_poses
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 TUKEY = 4.685
 
 

@@ -9,15 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.calibrate.multi_position import Estimate, estimates_of
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 LEAST_POSES = 12
 STILL = 0.02
 """Largest deviation of |f| from its median. Beyond it the body is accelerated."""

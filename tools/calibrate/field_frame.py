@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.calibrate.field_axes import strap
 from tools.calibrate.multi_position import Estimate
 
-Array = NDArray[np.float64]
 NOMINAL_V_PER_UT = 0.01
 
 

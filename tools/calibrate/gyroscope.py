@@ -15,12 +15,12 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
+from hal.arrays import Array
 from hal.compiled import kernel
 from tools.calibrate.multi_position import Estimate, MultiPosition, compensate, estimates_of, identify_poses
 from tools.calibrate.still import find_poses
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 NAMES = ("misalignment_yz", "misalignment_zy", "misalignment_xz", "misalignment_zx", "misalignment_xy")
 NAMES += ("misalignment_yx", "scale_x", "scale_y", "scale_z")
 LEAST_TURNS = 6

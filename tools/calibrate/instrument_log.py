@@ -10,18 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.control.plan import load_plan
 from firmware_py.frame import COUNTS, LAYOUT, MAGNETOMETER_RAW, XYZ
 from firmware_py.sensing.calibration import calibrate, calibrate_magnetometer, calibration_params, reading_names
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from hal.bench import load_bench
 from hal.compiled import kernel
 from tools.calibrate.logs import SensorLog, what_there_is
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 INPUTS = 8
 _FIELD = LAYOUT.start("magnetometer")
 

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.errors import InputError
 from tools.mismatch.recording_columns import SUFFIXES, column_names, column_units, read_columns
 
-Array = NDArray[np.float64]
 TIMES = ("t_s", "t", "time_s")
 LOST = 1.5
 """A step of time longer than this many samples is a gap."""

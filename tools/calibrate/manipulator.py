@@ -12,19 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.manipulator import star_tip
+from hal.arrays import Array
 from hal.npz import open_npz
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.multi_position import Estimate, estimates_of
 from tools.errors import InputError
-
-Array = NDArray[np.float64]
 
 LEAST_POSITIONS = 12
 NAMES = ("ball_circle_mm", "shaft_mm", "lever_1", "lever_2", "lever_3", "lean_x_mrad", "lean_y_mrad")

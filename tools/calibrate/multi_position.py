@@ -11,14 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.calibrate.still import FACTORS, find_poses, quiet_level
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 NAMES = ("misalignment_0", "misalignment_1", "misalignment_2", "scale_x", "scale_y", "scale_z")
 NAMES += ("bias_x", "bias_y", "bias_z")
 

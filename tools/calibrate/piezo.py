@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from threadpoolctl import threadpool_limits
 
+from hal.arrays import Array
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.piezo_dynamics import MAX_LAG_S, Dynamics, delayed, fit_dynamics
 from tools.calibrate.piezo_excitation import determined_from, missing, one_loop
@@ -27,8 +27,6 @@ from tools.calibrate.piezo_start import begins_with_step, fit_lag, from_rest
 from tools.calibrate.piezo_steps import fit_steps, is_steps
 from tools.errors import InputError
 from tools.mismatch.recording import Recording
-
-Array = NDArray[np.float64]
 
 # fine where a tremor's small loops run, coarse beyond (Ang 2004, 7.2.1); fractions of half the drive's range
 FAMILIES: dict[str, tuple[float, ...]] = {

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Complex = NDArray[np.complex128]
 
 MAX_LAG_S = 0.02

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.feedforward import Answer, design_feedforward, tracking_gain
+from hal.arrays import Array
 from tools.calibrate.piezo_dynamics import Dynamics
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 TAPS = 6

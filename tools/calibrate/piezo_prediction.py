@@ -8,16 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.actuation.config import StackConfig
 from firmware_py.actuation.hysteresis import drive, operator_params, plays_at, slopes_at, stack_stroke
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.records import Record, attributes
+from hal.arrays import Array
 from hal.compiled import kernel
 from tools.calibrate.piezo_fit import PiezoFit
 
-Array = NDArray[np.float64]
 UM = 1e-6
 
 

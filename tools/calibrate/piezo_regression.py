@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from firmware_py.actuation.config import StackConfig
 from firmware_py.actuation.hysteresis import inverse_thresholds, inverse_weights
+from hal.arrays import Array
 from hal.compiled import kernel
-
-Array = NDArray[np.float64]
 
 LEAST_SLOPE = 0.05  # smallest slope, relative to the mean one
 LEAST_ZONE = 0.5  # slope of a zone, relative to the first; a stack bends by some percent

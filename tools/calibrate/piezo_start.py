@@ -11,13 +11,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from hal.arrays import Array
 from tools.calibrate.piezo_dynamics import MAX_LAG_S, TAPS, Dynamics
 from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual
-
-Array = NDArray[np.float64]
 
 FIRST_S = 0.1
 FASTER = 3.0

@@ -9,14 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from hal.arrays import Array
 from tools.calibrate.piezo_dynamics import Dynamics
 from tools.errors import InputError
 from tools.mismatch.recording import Recording
-
-Array = NDArray[np.float64]
 
 LONGEST_S = 0.03
 SLOW_S = (10e-3, 50e-3)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 DEGREE = 5
 SPAN = DEGREE + 1
 """Coefficients that one instant depends on."""

@@ -23,12 +23,12 @@ from scipy.stats import t as student
 
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 from tools.calibrate.multi_position import Estimate
 from tools.calibrate.pivot_spline import Basis, Step, gauss_newton, uniform_basis
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 Complex = NDArray[Any]
 """Real numbers, or complex ones for a derivative."""
 FIT_HZ = 50.0

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.calibrate.multi_position import Estimate, missing_poses
 from tools.calibrate.still import spread
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 LARGEST_TURN_RESIDUAL = 0.15
 LEAST_TURN_STEPS = 20.0

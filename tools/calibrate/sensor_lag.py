@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from firmware_py.sensing.config import SensingConfig
-
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 
 @dataclass(frozen=True)

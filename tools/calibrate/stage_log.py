@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.calibrate.logs import load_log, what_there_is
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 ANGLES = (("alpha_deg", "beta_deg"), ("alpha_rad", "beta_rad"), ("stage_y_rad", "stage_z_rad"))
 AVERAGE_S = 5.0
 SAME_RAD = np.radians(0.02)

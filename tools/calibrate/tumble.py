@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from tools.calibrate.composite import CompositeFit, fit_composite
 from tools.calibrate.field_frame import FieldFrame, fit_field
 from tools.calibrate.stage_log import load_stage_log
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 NOMINAL_SUPPLY_V = 5.0
 SENSORS = ("1x", "1z", "2y", "2z", "3x", "3y")
 DRIFT_TOLERANCE_G = 2e-3

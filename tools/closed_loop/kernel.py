@@ -8,7 +8,6 @@ step at which a command arrives.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.frame import (
@@ -23,10 +22,9 @@ from firmware_py.frame import (
     TIME,
 )
 from firmware_py.records import Record
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.plant.kernel import STEPS_PER_MS, TRUTH_COLUMNS, advance, truth_row
-
-Array = NDArray[np.float64]
 
 WIRES = np.dtype(
     [

@@ -17,6 +17,7 @@ from firmware_py.control.wiring import sensing_table
 from firmware_py.frame import LAYOUT
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from hal.bench import BenchFile
 from sim_devices.config import emulation_config
 from sim_devices.plant.blocks import PlantBlocks
@@ -24,8 +25,6 @@ from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, advance, outputs_late
 from sim_devices.plant.recorded_hand import make_hand
 from tools.closed_loop.kernel import WIRES, closed_loop
 from tools.errors import InputError
-
-Array = NDArray[np.float64]
 
 COMMAND_DELAY_S = 497.5e-6
 """Scan to command of the default bench: 125 us of USB, 372.5 us on the I2C bus."""

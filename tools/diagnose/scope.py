@@ -6,16 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.control.wiring import open_devices
+from hal.arrays import Array
 from hal.bench import OpenBench
 from tools.diagnose.extremes import extremes
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 MAX_SCANS = 1024
 STEP_S = 0.1
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

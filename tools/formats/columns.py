@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.errors import RecordingError
 
-Array = NDArray[np.float64]
 MOST_SAMPLES = 50_000_000
 """Samples of a column, checked before anything of the size that a file claims is allocated."""
 

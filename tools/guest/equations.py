@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 ADD, SUB, MUL, DIV, POW, NEG, ABS, SIGN, SQRT, EXP, LOG, SIN, COS, TAN, TANH, ATAN, ATAN2, MIN, MAX, LESS, LEQ, PICK = (
     range(22)

@@ -12,12 +12,9 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.guest.fmu_linear import linear_equations, unsettled
-
-Array = NDArray[np.float64]
-
 
 RK_ERROR = 1e-6
 """Largest change of an output, as a share of its range, by which half the step may differ."""

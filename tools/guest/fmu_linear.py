@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 Evaluate = Callable[[Array, Array, float], Array]
 
 PROBES = 60

@@ -15,13 +15,11 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.children import child_command, child_environment
 from tools.errors import InputError
 from tools.guest.frames import SIZES_BYTES, FrameError, frame_parts, read_parts, read_sizes
-
-Array = NDArray[np.float64]
 
 
 class GuestError(InputError):

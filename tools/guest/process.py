@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.guest.frames import SIZES_BYTES, frame_parts, read_parts, read_sizes
 
-Array = NDArray[np.float64]
 Answer = tuple[dict[str, Any], dict[str, Array]]
 PR_SET_PDEATHSIG = 1
 

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.base import wait_s
 from drivers.imu.base import Imu, ImuBlock, ImuOffsets
 from firmware_py.endoscope.wiring import Sensor
+from hal.arrays import Array
 from hal.contracts import Clock
 from hal.types import STANDARD_GRAVITY, Status
 from tools.errors import InputError
@@ -22,7 +22,6 @@ from tools.imu.series import Series
 SETTLE_S, MEAN_S = 10.0, 10.0
 PATIENCE_S = 2.0
 Progress = Callable[[float], None]
-Array = NDArray[np.float64]
 
 
 def record(sensor: Sensor, clock: Clock, seconds: float, progress: Progress | None = None) -> Series:

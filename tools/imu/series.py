@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 from tools.calibrate.logs import SensorLog, load_log
 from tools.errors import InputError
 
-Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
 ACCEL_UNITS = {"g": 1.0, "m_s2": 1.0 / STANDARD_GRAVITY, "mg": 1e-3, "g_as_logged": 1.0}
 GYRO_UNITS = {"deg_s": 1.0, "dps": 1.0, "rad_s": 180.0 / np.pi}

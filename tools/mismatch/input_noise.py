@@ -12,12 +12,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct, idct
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter, lfiltic
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 WIDTHS = (15, 31, 63, 127, 255)
 """Numbers of neighbouring frequencies over which the power of a continuous spectrum is averaged."""
 SHRINK = 4.505

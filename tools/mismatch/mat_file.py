@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.errors import RecordingError
 
-Array = NDArray[np.float64]
 MOST_BYTES = 2 << 30
 MOST_DEPTH = 8
 MOST_ACROSS = 64

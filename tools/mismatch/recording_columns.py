@@ -12,17 +12,16 @@ from pathlib import Path
 
 import numpy as np
 from mcap.records import Channel
-from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError as McapRecordingError
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.scan import ChunkMessage, mcap_records
+from hal.arrays import Array
 from hal.npz import open_npz
 from tools.errors import RecordingError, missing_column
 from tools.formats import mdf, netcdf, parquet
 from tools.mismatch import mat_file, text_table
 
-Array = NDArray[np.float64]
 SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap", ".parquet", ".nc", ".mf4")
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000

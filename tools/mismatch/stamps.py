@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.recording_clock import LONGEST_GAP, MOST_MISSING
 
-Array = NDArray[np.float64]
 MOST_PLACES = 5
 UNEVEN = 0.5
 """Steps that differ from the usual one by more than this share are counted as uneven."""

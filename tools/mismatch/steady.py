@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.periods import period_of
 from tools.numbers import rms
-
-Array = NDArray[np.float64]
 
 REPEATS = 1e-3
 """Largest rms difference of a commanded input from itself one period later, over its rms."""

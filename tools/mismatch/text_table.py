@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.errors import RecordingError, missing_column
 from tools.mismatch import units
 
-Array = NDArray[np.float64]
 SUFFIXES = (".csv", ".tsv", ".txt")
 HEAD_BYTES = 1 << 20
 HEAD_LINES = 200

@@ -7,12 +7,9 @@ import re
 from dataclasses import dataclass
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 
-Array = NDArray[np.float64]
 Dimension = tuple[int, ...]
 """Exponents of metre, kilogram, second, ampere, kelvin, radian, count."""
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
+from hal.arrays import Array
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
 TERMS = ("white", "flicker", "walk", "ramp")
 FLAT = 2.0 * log(2.0) / pi
 EXCESS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 AXES = ("x", "y", "z")
 TREMOR_BAND_HZ = (8.0, 12.0)
 VOLUNTARY_HZ = 1.0

@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from hal.arrays import Array
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
 from tools.reports.figures import AXES, FOUR_BANDS_HZ, SHOWN_HZ, TREMOR_BAND_HZ, band_name, band_pass, density_text
 from tools.terminal import table_of
 
-Array = NDArray[np.float64]
 NOTHING_UM = 0.2
 """Below this a percentage says nothing: the change is given in um."""
 

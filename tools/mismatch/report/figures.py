@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.report import BetweenRecordings, Pictures, Report, Together
 from tools.mismatch.report import series
 from tools.mismatch.report.svg import AFTER, BEFORE, GIVEN, HELD, INK, MEASURED, NOISE, figure
 from tools.mismatch.report.wording import scaled, shown_in
 
-Array = NDArray[np.float64]
 WIDTH_IN = 11.6
 HALF_IN = 5.7
 POINTS = 600

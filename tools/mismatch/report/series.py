@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.features import envelope, last_reversal, local_frequency, rate_of, recent_mean
 from tools.mismatch.engine.report import DependsOn, Pictures, Report
 
-Array = NDArray[np.float64]
 Span = tuple[int, int]
 
 

@@ -17,14 +17,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import toeplitz
 
+from hal.arrays import Array
 from tools.errors import InputError
 from tools.mismatch.engine.colour import Whitener, fit_whitener
-
-Array = NDArray[np.float64]
 
 FIGURES = ("level", "power")
 TILTS = (0.25, 0.5, 1.0, 1.5)

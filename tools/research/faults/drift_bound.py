@@ -16,16 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from firmware_py.frame import COUNTS
+from hal.arrays import Array
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
 from tools.research.faults.campaign import FaultRow
 from tools.research.faults.points import POINTS, write_bench
 
-Array = NDArray[np.float64]
 ORDER = 40  # ms of the past from which the hand's next reading is predicted
 AXES = 6
 SECONDS = 120.0

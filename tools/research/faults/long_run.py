@@ -17,17 +17,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.app import run_in_process
 from firmware_py.frame import QUATERNION, TICK
 from firmware_py.run_request import RunRequest
+from hal.arrays import Array
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
 from sim_devices.plant.kernel import TRUTH
 from tools.closed_loop.simulate import simulate
 
-Array = NDArray[np.float64]
 EIGHTHS = 8
 PARTS = 8
 """Number of parts of an eighth, whose scatter says how much an eighth varies by chance."""

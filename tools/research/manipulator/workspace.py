@@ -11,15 +11,13 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.manipulator import strokes_from_tip, tilt_jacobian, tip_from_strokes, tip_jacobian
 from firmware_py.actuation.stage import actuate_params
 from firmware_py.records import attributes
-
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 from tools.research.placement.configurations import Placement
 from tools.research.placement.variance import (
@@ -25,7 +25,6 @@ from tools.research.placement.variance import (
     rate_covariance_unscented,
 )
 
-Array = NDArray[np.float64]
 BAND_HZ = (8.0, 12.0)
 RC_RAD_S = 1.0 / (32e3 * 0.33e-6)
 DOWN_40 = (0.643, 0.0, -0.766)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 
 @dataclass(frozen=True)

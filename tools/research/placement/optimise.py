@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from firmware_py.sensing.kinematics import observation_matrix
+from hal.arrays import Array
 from tools.research.placement.configurations import Placement
 from tools.research.placement.space import Space
 
-Array = NDArray[np.float64]
 LENGTH_M = 0.05
 """Unit of position in the optimiser, so that its variables are of one size."""
 DRAWS = 200

@@ -7,13 +7,11 @@ Linear propagation through the weighted least squares of the firmware, and the s
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.sensing.kinematics import kinematic_params, observation_matrix
 from firmware_py.sensing.numeric_kinematics import solve_numeric
+from hal.arrays import Array
 from tools.research.placement.configurations import Placement
-
-Array = NDArray[np.float64]
 
 
 def motion_covariance(placement: Placement, noise: Array | float) -> Array:

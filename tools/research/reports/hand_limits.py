@@ -13,14 +13,12 @@ from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from firmware_py.tremor.adaptive_design import band
 from firmware_py.tremor.config import AdaptiveConfig
+from hal.arrays import Array
 from sim_devices.plant.kernel import STEP_NS
 from tools.closed_loop.simulate import SimulatedRun
 from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ, band_pass
 from tools.research.tremor.cases import RATE_HZ
 from tools.research.tremor.ideal import bound_residual
-
-Array = NDArray[np.float64]
-
 
 SWING_S = 3.0
 FINE_HZ = 1e9 / STEP_NS

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand_file import load_hand
 from sim_devices.plant.recorded_hand import RecordedHand
 from tools.research.reproduce.actuation_lab import LOW_UM, SCORED
 from tools.research.reproduce.real_sensors import data_folder
-
-Array = NDArray[np.float64]
 
 HANDS = {
     "stretched arm": "tremor_duke_adxl345/data.npz#arm_extended_no_tremor",

@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from firmware_py.actuation.config import StackConfig
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS
 from sim_devices.plant.lab import (
@@ -34,8 +34,6 @@ from tools.calibrate.piezo_prediction import command
 from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual, stack_of
 from tools.mismatch.recording import Recording, Split, TwinText
 from tools.numbers import rms
-
-Array = NDArray[np.float64]
 
 UNIT = 2  # of the emulated instrument
 DT_S = 1e-3

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import COMMAND, CONFIDENCE, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.manipulator import tip_displacement
@@ -21,8 +21,6 @@ from tools.research.manipulator.workspace import analyse
 from tools.research.reproduce.actuation_hand import present, recorded_tip_m
 from tools.research.reproduce.actuation_lab import DT_S, lab, run
 from tools.research.reproduce.rows import Row
-
-Array = NDArray[np.float64]
 
 TICKS = 6000
 SCORED_FROM = 1000

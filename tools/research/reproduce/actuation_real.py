@@ -8,9 +8,9 @@ were fitted to the test file (``stack_plants``), over the path that the authors 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from hal.arrays import Array
 from tools.calibrate.piezo import identify_stack
 from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import command, simulate
@@ -20,8 +20,6 @@ from tools.numbers import rms
 from tools.research.reproduce.real_sensors import data_folder
 from tools.research.reproduce.rows import Row
 from tools.research.reproduce.stack_plants import Plant, narx, preisach
-
-Array = NDArray[np.float64]
 
 SKIP = 200
 """Samples of the first second, which holds the start."""

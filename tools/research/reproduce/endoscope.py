@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
+from hal.arrays import Array
 from tools.imu.offsets import gyroscope_mean
 from tools.imu.series import Scales, load_series
 from tools.research.endoscope.experiment import RESPONSES_S, Mapping, run_cell
@@ -18,7 +18,6 @@ from tools.research.reproduce.endoscope_imu import imus
 from tools.research.reproduce.real_sensors import data_folder
 from tools.research.reproduce.rows import Row, Section, Table, build
 
-Array = NDArray[np.float64]
 START_DEG = 43.87  # Figures 3.12 and 3.13: "nearly 45 degrees"
 RATE_HZ = 100.0
 SLOW_S = 10.0

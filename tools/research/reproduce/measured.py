@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.recording.revision import git_revision
+from hal.arrays import Array
 from tools.errors import InputError
 from tools.mismatch.infer import diagnose
 from tools.numbers import rms
@@ -33,7 +33,6 @@ from tools.research.reproduce.recordings import data_folder
 from tools.research.reproduce.rows import Table
 from tools.research.results.artefact import read_page
 
-Array = NDArray[np.float64]
 LEAST_WINDOW = 20  # samples that the engine takes to set a state, where any may
 MOST_LEFT = 20_000  # samples of a residual that are tested for what they follow
 

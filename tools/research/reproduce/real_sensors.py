@@ -10,8 +10,8 @@ from importlib.util import find_spec
 from math import floor, log10
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.gyroscope import fit_gyroscope, rate_matrix, turned_gravity
@@ -24,7 +24,6 @@ from tools.research.reproduce import broad
 from tools.research.reproduce.recordings import data_folder, meta
 from tools.research.reproduce.rows import Row, Table, build
 
-Array = NDArray[np.float64]
 ACCELEROMETER = ("acc_x_raw", "acc_y_raw", "acc_z_raw")
 GYROSCOPE = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw")
 

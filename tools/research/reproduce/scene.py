@@ -10,11 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.frame import COUNTS, LAYOUT, MAGNETOMETER_FRESH, MAGNETOMETER_RAW, STATUS, TICK
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing, sense_kernel
+from hal.arrays import Array
 from hal.compiled import kernel
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import NODE_S, Hand
@@ -25,7 +25,6 @@ from sim_devices.plant.sensors import sensor_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
 
-Array = NDArray[np.float64]
 LSB_V = 10.0 / 65536.0
 ADC_V = 187.5e-6  # ADS1115 at +-6.144 V
 ADC_EVERY = 10  # ticks

@@ -12,11 +12,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.translation import displacement_response
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.hand import SyntheticHand
 from sim_devices.plant.lab import measure_tumble
@@ -25,7 +25,6 @@ from tools.research.reproduce.rows import Row
 from tools.research.reproduce.scene import SceneResult, run_scene
 from tools.research.reproduce.sensing_static import drawing
 
-Array = NDArray[np.float64]
 BAND_HZ = (8.0, 12.0)
 SECONDS = 40.0
 SETTLE_S = 8.0

@@ -6,12 +6,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt, sosfreqz
 from scipy.spatial.transform import Rotation
 
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 from sim_devices.config import EmulationConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.hand import SyntheticHand
@@ -25,7 +25,6 @@ from tools.research.reproduce.scene import SceneResult, run_scene
 from tools.research.reproduce.sensing_static import UNITS, calibrated, drawing
 from tools.research.tremor.ideal import PERFECT_EMULATION
 
-Array = NDArray[np.float64]
 RATE_HZ = 1000.0
 IDEAL = SensorConfig(
     **{k: v for k, v in PERFECT_EMULATION["sensors"].items() if k not in ("daq_noise_uV", "magnetometer_noise_uG")}

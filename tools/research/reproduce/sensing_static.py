@@ -13,10 +13,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.sensing.calibration import calibration_params, composite
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig, SensorConfig
 from sim_devices.plant.kernel import TRUTH_COLUMNS, begin
 from sim_devices.plant.lab import measure_tumble
@@ -26,7 +26,6 @@ from tools.calibrate.stage_log import stage_attitude
 from tools.calibrate.tumble import identify
 from tools.research.reproduce.rows import Row
 
-Array = NDArray[np.float64]
 UNITS = (1, 2, 3, 4, 5)
 DEFAULT = SensorConfig()
 LARGE = SensorConfig(

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 from scipy.signal import lfilter
 
+from hal.arrays import Array
 from hal.compiled import kernel
 
-Array = NDArray[np.float64]
 LEVELS = 20
 TERMS = 9
 SKIP = 200

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.tremor.adaptive_design import design_adaptive
 from firmware_py.tremor.config import Method, TremorConfig
+from hal.arrays import Array
 from tools.research.reproduce import tremor_hands
 from tools.research.reproduce.recordings import data_folder
 from tools.research.reproduce.rows import Kind, Row, Table, build
@@ -21,7 +21,6 @@ from tools.research.tremor.report_published import TUNED_ALONE, TUNED_MIXED, lef
 from tools.research.tremor.scores import score
 from tools.research.tremor.signals import load_signals
 
-Array = NDArray[np.float64]
 HANDS = (101, 102, 103)
 SEEDS = (201, 202, 203)
 LOOP_MS = 2

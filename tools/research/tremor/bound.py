@@ -15,14 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from firmware_py.tremor.adaptive_design import AdaptiveDesign, design_adaptive, solve_scaled
 from firmware_py.tremor.config import TremorConfig
+from hal.arrays import Array
 from tools.research.tremor.cases import RATE_HZ, Case
 
-Array = NDArray[np.float64]
 EVERY = 5  # samples between the rows of a regression: the bank is far narrower than 100 Hz
 SKIP_S = 5.0  # a new hand: adaptation is over
 

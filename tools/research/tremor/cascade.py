@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record, new_record
+from hal.arrays import Array
 from hal.compiled import kernel
 from tools.research.tremor.activations import KINDS, activation
 
-Array = NDArray[np.float64]
 Target = Literal["voluntary", "error"]
 
 

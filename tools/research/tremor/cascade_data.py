@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.research.tremor.cascade_training import Paths
 from tools.research.tremor.signal import TremorSignal
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 250.0
 FILE_S = 16.0

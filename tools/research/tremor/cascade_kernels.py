@@ -7,10 +7,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
 from tools.research.tremor.activations import activation, slope
-
-Array = NDArray[np.float64]
 
 GROWTH = 1.75  # of a quickprop step over the one before (Fahlman 1988)
 

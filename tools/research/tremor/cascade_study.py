@@ -7,13 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.research.tremor.cascade import Cascade, CascadeNetwork
 from tools.research.tremor.cascade_data import RATE_HZ, Making, Subject, learning_paths, voluntary
 from tools.research.tremor.cascade_training import Trained, Training, train
-
-Array = NDArray[np.float64]
 
 WINDOWS = ((75, 1), (50, 2), (50, 4))
 """Inputs and their spacing in samples of 4 ms that are tried; 5.3.4 found 50 to 100 without spacing."""

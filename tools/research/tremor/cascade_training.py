@@ -15,11 +15,10 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.research.tremor.activations import KINDS
 from tools.research.tremor.cascade import CascadeNetwork, Target
 from tools.research.tremor.cascade_kernels import ndekf_pass, quickprop, unit_outputs
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

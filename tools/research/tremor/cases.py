@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from scipy.signal import butter, lfilter, sosfiltfilt
 
 from firmware_py.tremor.config import TremorConfig
+from hal.arrays import Array
 from tools.errors import InputError
 from tools.reports.figures import band_pass
 from tools.research.tremor.signal import TremorSignal
 from tools.research.tremor.signals import load_signals
 from tools.research.tremor.spectrum import highest_line, periodogram
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 1000.0
 INVOLUNTARY_HZ = (2.0, 4.0, 16.0, 20.0)

@@ -8,16 +8,15 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.tremor.adaptive_design import design_adaptive
 from firmware_py.tremor.config import Method, TremorConfig
 from firmware_py.tremor.estimator import Estimator
+from hal.arrays import Array
 from tools.research.tremor.bound import SKIP_S, wiener_bounds
 from tools.research.tremor.cases import EMULATED, RATE_HZ, Case
 from tools.research.tremor.scores import Score, score
 
-Array = NDArray[np.float64]
 OTHERS, ORACLE, UNSEEN = "limit: others", "limit: oracle", "limit: itself unseen"
 LIMITS = (OTHERS, ORACLE, UNSEEN)
 HORIZONS_MS = (0, 2, 8, 20)

@@ -26,14 +26,13 @@ from numpy.typing import NDArray
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.estimator import Estimator
+from hal.arrays import Array
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
 from tools.reports.figures import tremor_figures
 from tools.research.tremor.bench_variant import merged, write_variant
 from tools.research.tremor.bound import bank_features, lift
 from tools.research.tremor.cases import RATE_HZ, involuntary_band, rc_filter, sensor_noise
-
-Array = NDArray[np.float64]
 
 SETTLE_S = 5.0
 GOAL = 1.2

@@ -12,12 +12,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.research.tremor.signal import TremorSignal
 from tools.research.tremor.spectrum import Spectrum, highest_line, line_spread_hz, mean_spectrum, periodogram, segments
-
-Array = NDArray[np.float64]
 
 HARMONICS = (2, 3)
 

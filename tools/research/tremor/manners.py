@@ -14,9 +14,8 @@ from scipy.signal import lfilter
 
 from firmware_py.tremor.config import Method, TremorConfig
 from firmware_py.tremor.estimator import Estimator
+from hal.arrays import Array
 from tools.research.tremor.cases import RATE_HZ, sensor_noise
-
-Array = NDArray[np.float64]
 
 SIZE_M = 25e-6
 SETTLED = 0.3

@@ -13,13 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.signal import butter, lfilter, sosfilt
 
+from hal.arrays import Array
 from tools.research.tremor.bound import SKIP_S
 from tools.research.tremor.cases import RATE_HZ, Case
 
-Array = NDArray[np.float64]
 TREMOR_M, VOLUNTARY_M, NOISE_M = 50e-6, 300e-6, 1e-6
 VOLUNTARY_ORDER = 2
 TAPS = 200

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.frame import JERK
 from firmware_py.tremor.detector_config import DetectorConfig
 from firmware_py.tremor.detectors import Detectors
+from hal.arrays import Array
 from tools.research.tremor.cascade_data import integrated
 from tools.research.tremor.report import Progress, table
 from tools.research.tremor.signal import TremorSignal
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 1000.0
 TREMOR_RMS_M = 17.7e-6  # 50 um p-p

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import hilbert
 
 from firmware_py.tremor.adaptive_design import AdaptiveDesign
+from hal.arrays import Array
 from tools.reports.figures import TREMOR_BAND_HZ, VOLUNTARY_HZ, band_pass
 from tools.research.tremor.bound import SKIP_S, lift
 from tools.research.tremor.cases import RATE_HZ, Case, low_pass
 
-Array = NDArray[np.float64]
 _EDGE_S = 1.0  # zero-phase filters and targets are not trusted this close to the end
 
 

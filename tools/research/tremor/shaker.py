@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.research.tremor.inspect import Inspection, Rule, inspect
 from tools.research.tremor.signal import TremorSignal
-
-Array = NDArray[np.float64]
 
 SHAKER_RULE = Rule(band_hz=(1.5, 15.0))  # the shaker goes down to 2 Hz
 FOLDS = 10

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.even_samples import evenly
 from tools.errors import InputError
 from tools.mismatch import units
 from tools.research.tremor.signal import TremorSignal
-
-Array = NDArray[np.float64]
 
 _QUANTITIES = (("acceleration", "m/s^2"), ("angular rate", "rad/s"), ("displacement", "m"))
 _SUFFIXES = {"m_s2": "m/s^2", "m_s_2": "m/s^2", "rad_s": "rad/s", "deg_s": "deg/s", "dps": "deg/s"} | {

@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.even_samples import evenly
 from hal.types import STANDARD_GRAVITY
 from tools.errors import InputError
 from tools.research.tremor.clock import rate_from_known
 from tools.research.tremor.signal import Reference, TremorSignal, Windows
 from tools.research.tremor.spectrum import highest_line, periodogram
-
-Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
 _DRIVEN_BAND = (0.015, 0.16)  # cycles per sample: 1.5 to 16 Hz at the stated rate

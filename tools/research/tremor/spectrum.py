@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 PADDING = 8  # frequency grid this much finer than 1 / length: the parabola is then good to 1e-3 of a bin
 

@@ -11,7 +11,6 @@ from math import pi, sqrt
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from firmware_py.sensing.translation import integrator_sections
@@ -19,11 +18,11 @@ from firmware_py.tremor.adaptive_design import sensor_response
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
 from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.validation import Positive, StrictTable, validate_table
 
-Array = NDArray[np.float64]
 OUTPUTS = 2
 SECTIONS = 5
 RING_S = 0.5  # of the longest horizon (one period at 7 Hz and the loop) and the regressor

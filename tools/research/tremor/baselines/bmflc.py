@@ -19,11 +19,11 @@ from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
 from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sections, prefilter_step
 from firmware_py.tremor.seen import seen_params, undo
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.validation import Positive, StrictTable, validate_table
 
-Array = NDArray[np.float64]
 FOLLOW_TICKS = 50  # the band of E-BMFLC moves this often
 MEMORY, NUMBERS = 4096, 256
 MOST = 29
