@@ -7,11 +7,12 @@ Rich reads ``[running]`` or ``[firmware]`` as a style and leaves it out. Style i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import Progress, ProgressColumn, TextColumn
+from rich.progress import Progress, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.status import Status
 from rich.table import Column, Table
 from rich.text import Text
@@ -69,6 +70,14 @@ def progress_bar(console: Console, *columns: ProgressColumn) -> Progress:
 def task_name() -> TextColumn:
     """Return the column of a progress display that names the task, as plain text."""
     return TextColumn("{task.description}", markup=False)
+
+
+@contextmanager
+def spinner(console: Console) -> Iterator[Callable[[str], None]]:
+    """Show that work goes on, and since when; the function that it yields shows what is being done."""
+    with progress_bar(console, SpinnerColumn(), task_name(), TimeElapsedColumn()) as progress:
+        task = progress.add_task("starting")
+        yield lambda text: progress.update(task, description=text)
 
 
 def _plain(text: RenderableType | None) -> RenderableType | None:

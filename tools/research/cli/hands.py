@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import SpinnerColumn, TimeElapsedColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
@@ -17,7 +16,7 @@ from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
-from tools.terminal import progress_bar, task_name
+from tools.terminal import spinner
 
 if TYPE_CHECKING:
     from tools.reports.figures import TremorFigures
@@ -66,21 +65,15 @@ def hands(
         stamp = revision_and_day()
         seeds = draw_people(stamp.split(",")[0], people)
         synthetic: list[tuple[TremorFigures, FineMotion]] = []
-        with progress_bar(console(), SpinnerColumn(), task_name(), TimeElapsedColumn()) as progress:
-            task = progress.add_task("starting")
-
-            def show(text: str) -> None:
-                progress.update(task, description=text)
-
-            with keep_what_is_there():
-                if folder is None:
-                    result = run_hands(file, data, seconds, show)
-                else:
-                    result = run_heldout(file, folder, seconds, show)
-                for row in result:
-                    rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
-                for person in run_people(file, seeds, seconds, show):
-                    synthetic.append(person)  # noqa: PERF402
+        with spinner(console()) as show, keep_what_is_there():
+            if folder is None:
+                result = run_hands(file, data, seconds, show)
+            else:
+                result = run_heldout(file, folder, seconds, show)
+            for row in result:
+                rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
+            for person in run_people(file, seeds, seconds, show):
+                synthetic.append(person)  # noqa: PERF402
         need_some(rows)
         page = (
             markdown(rows, seconds, stamp, synthetic, seeds)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
@@ -14,7 +13,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
-from tools.terminal import progress_bar, table_of, task_name
+from tools.terminal import spinner, table_of
 
 
 def budget(
@@ -45,9 +44,8 @@ def budget(
         if ideal:
             _ideal(bench_path(bench), seconds, json_file)
             return
-        with _progress() as progress:
-            task = progress.add_task("starting")
-            rows = list(runs(bench_path(bench), seconds, lambda text: progress.update(task, description=text)))
+        with spinner(console()) as show:
+            rows = list(runs(bench_path(bench), seconds, show))
         if json_file != "-":
             title = "tip tremor in 8-12 Hz, and the cost of each source in four bands, um rms (vectors)"
             costs = (f"cost {band_name(band)}" for band in FOUR_BANDS_HZ)
@@ -60,19 +58,13 @@ def budget(
         write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
 
 
-def _progress() -> Progress:
-    columns = (SpinnerColumn(), task_name(), TimeElapsedColumn())
-    return progress_bar(console(), *columns)
-
-
 def _ideal(bench: Path, seconds: float, json_file: str | None) -> None:
     from tools.research.tremor.ideal import GOAL, IdealRow, ideal_run
 
     rows: list[IdealRow] = []
-    with _progress() as progress:
-        task = progress.add_task("starting")
+    with spinner(console()) as show:
         for noise in (True, False):
-            progress.update(task, description=f"ideal instrument, accelerometer noise {'on' if noise else 'off'}")
+            show(f"ideal instrument, accelerometer noise {'on' if noise else 'off'}")
             rows.append(ideal_run(bench, seconds, noise))
     if json_file != "-":
         title = "ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted"

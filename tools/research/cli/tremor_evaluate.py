@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import SpinnerColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
@@ -15,7 +14,7 @@ from tools.cli.run import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.research.tremor.baselines import BASELINES
-from tools.terminal import progress_bar, task_name
+from tools.terminal import spinner
 
 
 def evaluate(
@@ -86,11 +85,8 @@ def evaluate(
         cases = [c for source in recordings for c in cases_from(source, not as_recorded, not as_recorded)]
         for note in dict.fromkeys(f"{c.name}: {note}" for c in cases for note in c.notes):
             console().print(f"note: {note}", soft_wrap=True)
-        with progress_bar(console(), SpinnerColumn(), task_name(), TimeElapsedColumn()) as progress:
-            task = progress.add_task("starting")
-            results = evaluate_cases(
-                cases, methods, horizons, progress=lambda text: progress.update(task, description=text)
-            )
+        with spinner(console()) as show:
+            results = evaluate_cases(cases, methods, horizons, progress=show)
             behaviour = manners(methods) if with_manners else []
         lines = summarise(results)
         if png is not None:
