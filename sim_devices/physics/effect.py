@@ -266,6 +266,9 @@ class Effect:
     variants: tuple[Effect, ...] = ()
     """Other forms of the same physics, or other places in the equations (hysteresis as a force), with the same name and
     another equation."""
+    other_laws: tuple[Effect, ...] = ()
+    """Other laws with the same parameters in the same order, which are fitted once the effect is named: where they fit
+    as well, its intervals hold their values, too."""
     fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False

@@ -439,5 +439,9 @@ _SLOW_FALL_BRISTLES = replace(
 STRIBECK_FRICTION = replace(
     _SQUARED,
     confusable_with=("coulomb_friction",),
-    variants=(_TUSTIN, _SLOW_FALL, _STRIBECK_BRISTLES, _SLOW_FALL_BRISTLES),
+    other_laws=(_SLOW_FALL,),
+    variants=(
+        replace(_TUSTIN, other_laws=(_SLOW_FALL,)),
+        replace(_STRIBECK_BRISTLES, other_laws=(_SLOW_FALL_BRISTLES,)),
+    ),
 )

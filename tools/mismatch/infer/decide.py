@@ -19,6 +19,7 @@ from tools.mismatch.engine.unexplained import LEAST_LEAD, Leftover, Stranger, ab
 from tools.mismatch.infer.borne_out import Out, borne_out, doubts_of, entry_of
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
+from tools.mismatch.infer.loudness import louder_with
 from tools.mismatch.infer.store import Scored, Store, part_of
 
 MARGIN = 1.05
@@ -232,8 +233,9 @@ def forms_as_good(store: Store, chosen: Scored) -> tuple[Fit, ...]:
     alike = [
         s
         for s in store.sets.values()
-        if s.proper and s.key != chosen.key and sorted((e.effect.name, e.site, e.target) for e in s.placed) == where
+        if s.key != chosen.key and sorted((e.effect.name, e.site, e.target) for e in s.placed) == where
     ]
+    alike += [store.with_law(chosen, k, law) for k, e in enumerate(chosen.placed) for law in e.effect.other_laws]
     if not where or not alike:
         return ()
     margins, own = _margins(store, chosen), {part_of(e) for e in chosen.placed}
@@ -242,7 +244,7 @@ def forms_as_good(store: Store, chosen: Scored) -> tuple[Fit, ...]:
         other = [e for e in s.placed if part_of(e) not in own]
         touched = [o for e in other for o in e.outputs]
         margin = {o: min(margins[e.effect.name][o] for e in other) for o in store.problem.twin.outputs}
-        if _against(store.problem, chosen, s, touched, margin)[2]:
+        if s.proper and _against(store.problem, chosen, s, touched, margin)[2]:
             good.append(s)
     refined = (store.refined(s).fitted for s in good[:FORMS])
     return tuple(f for f in refined if not doubts_of(store.problem, f))
@@ -415,7 +417,15 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
         coloured = rest_of(p, final.fitted, of_any_colour=True)
         if is_whole(*worst_left(p, store.base.fitted, coloured, doubt=False), c):
             loudest = tuple(o for o, (_, hi) in coloured.floors.items() if hi > rest.floors[o][1])
-            return Judged(final, coloured, True, loudest, False)
+            known = {o: d for o in loudest if (d := louder_with(p, coloured.fit, o)) is not None}
+            if not known:
+                return Judged(final, coloured, True, loudest, False)
+            # noise is not louder where the simulation moves more
+            left = {
+                o: replace(v, follows=(known[o], *v.follows), real=True) if o in known else v
+                for o, v in rest.left.items()
+            }
+            return Judged(final, replace(rest, left=left), False, (), False)
     # without a named effect the noise as estimated decides, so that the doubt is reported
     whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()

@@ -291,6 +291,12 @@ class Store:
             begin = with_balance(self.problem, model, [theta])
             return self.put(fit(self.problem, model, begin, stride=2, iterations=12))
 
+    def with_law(self, s: Scored, k: int, law: Effect) -> Scored:
+        """Return the set with another law in place of that of effect ``k``, started from the same parameters."""
+        placed = [replace(p, effect=law) if i == k else p for i, p in enumerate(s.placed)]
+        with np.errstate(all="ignore"):
+            return self.put(fit(self.problem, Model(self.problem.twin, placed), [s.fitted.theta], iterations=15))
+
     def refined(self, s: Scored) -> Scored:
         """Return the set fitted on every row until convergence."""
         with np.errstate(all="ignore"):
