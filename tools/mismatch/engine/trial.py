@@ -140,15 +140,18 @@ def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int 
     """Select the candidates for a fit: per output the best by their one-step share.
 
     Specific effects, flexible families (which one step overestimates) and events or noise with a test of their own are
-    ranked separately (of each ``least``, and up to ``most`` that are near the best). Candidates that are clear by their
-    own test are added. Forms of an effect share one rank.
+    ranked separately (of each ``least``, and up to ``most`` that are near the best). Those inside the equations have a
+    rank of their own as well: one step underestimates an outflow beside which the base moves far. Candidates that are
+    clear by their own test are added. Forms of an effect share one rank.
     """
     keep = [False] * len(candidates)
     outputs = sorted({o for c in candidates for o in c.placed.outputs})
     kinds = ["tested" if c.tested else "flexible" if freedom(c) > 4 else "specific" for c in candidates]
+    inside = ["inside" if c.placed.site == "feedback" and not c.tested else "" for c in candidates]
     for o in outputs:
-        for kind in ("specific", "flexible", "tested"):
-            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and kinds[i] == kind]
+        for kind in ("specific", "flexible", "tested", "inside"):
+            of = inside if kind == "inside" else kinds
+            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and of[i] == kind]
             here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
             top = candidates[here[0]].share if here else 0.0
             names = list(dict.fromkeys(candidates[i].placed.effect.name for i in here))
