@@ -8,13 +8,14 @@ help, read from the source.
 from __future__ import annotations
 
 import ast
+import errno
 import os
 import sys
 from importlib import import_module
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -218,17 +219,30 @@ for _name, _command in COMMANDS.items():
     app.command(_name, rich_help_panel=_command.panel)(lambda: None)
 
 
+def _end(message: str, code: Exit) -> NoReturn:
+    sys.stderr.write(f"micron: {message}\n")
+    raise SystemExit(code)
+
+
 def main() -> None:
     """Run the ``micron`` script."""
     use_one_thread()
     install_handler()
     handle = None
+    try:
+        Path.cwd()
+    except OSError as error:
+        _end(f"the working folder cannot be used ({error.strerror}); change to another one", Exit.BAD_INPUT)
     if SUPERVISED in os.environ:
         from tools.cli.supervise import begin_supervised
 
         handle = begin_supervised()
     try:
         app()
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        _end(f"standard output: cannot be written ({error.strerror}); free some space", Exit.FAILED)
     except BaseException as end:
         if not was_interrupted() or (isinstance(end, SystemExit) and end.code == Exit.INTERRUPTED):
             raise

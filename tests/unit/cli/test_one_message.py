@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -92,3 +94,21 @@ def test_a_watched_twin_is_read_before_anything_is_compiled(tmp_path: Path, monk
 @pytest.mark.parametrize("command", ["run", "bench", "simulate"])
 def test_a_negative_seed_is_refused(command: str) -> None:
     assert "'--seed'" in refused(command, "--seed", "-1")
+
+
+def test_a_full_device_and_a_folder_that_is_gone_are_one_message_even_for_the_help(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    leave = f"import os, sys; os.chdir({str(gone)!r}); os.rmdir({str(gone)!r}); sys.argv = ['micron', '--help']; "
+    run = "from tools.cli.main import main; main()"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", f"import sys; sys.argv = ['micron', '--help']; {run}"],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=120,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == "micron: standard output: cannot be written (No space left on device); free some space\n"
+    done = subprocess.run([sys.executable, "-c", leave + run], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.startswith("micron: the working folder cannot be used (No such file or directory)")
+    assert done.stderr.count("\n") == 1
