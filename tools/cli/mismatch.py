@@ -15,7 +15,7 @@ from tools.cli.mismatch_heal import heal
 from tools.cli.mismatch_plan import plan, read_report
 from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import Outputs, check_folder, check_names, check_writable, write_json, write_text_atomic
 from tools.terminal import progress_bar, table_of, task_name
@@ -348,7 +348,12 @@ def apply(
         from tools.mismatch.apply import corrected_twin
 
         body = read_report(report)
-        twin = corrected_twin(recording, body)
+        try:
+            twin = corrected_twin(recording, body)
+        except RecordingError:
+            raise
+        except InputError as error:
+            raise InputError(f"{report}: {error}") from error
         if original is not None and twin.kind != "piezo_stack":
             raise InputError(
                 f"{bench}: a bench runs twins of kind piezo_stack, and this one is a {twin.kind}; leave --bench out"
