@@ -98,7 +98,7 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
     without = rest.carry(model, believed, view.recording)
     x, ctx = probe_signals(rest, view, without, pl, pl.outputs[0])
     residual = full_residual(rest, view, without, pl.outputs[0])
-    if not np.all(np.isfinite(residual)):
+    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(x))):
         return []  # beside the effects present that base runs away
     guesses = pl.effect.guess(x, residual, ctx, pl.settings)
     own = [believed.copy() for _ in guesses[:2]]

@@ -17,6 +17,7 @@ from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import starts
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 
@@ -277,6 +278,22 @@ def test_a_velocity_differs_with_the_direction_of_its_position(tmp_path: Path) -
     places = [p.target for p in sites(make(recording), recording, EFFECTS["direction_dependence"])]
     assert places
     assert all(p.endswith("by direction of angle") for p in places)
+
+
+def test_a_belief_that_runs_away_gives_no_start(tmp_path: Path) -> None:
+    """The engineer's own base may diverge where the re-fitted one does not: a guess from its course would be none."""
+    grows = MOTOR.replace("tau = 0.09", "tau = -0.002")
+    u = command()
+    recording = recorded(tmp_path, grows, u, 0.1 * u[::-1])
+    twin = make(recording)
+    (place, *_) = sites(twin, recording, EFFECTS["clock_skew"])
+    model = Model(twin, [replace(place, settings={"time": (1 / RATE_HZ, u.size / RATE_HZ)})])
+    theta = model.start(recording)
+    theta[[p.name for p in model.parameters].index("tau")] = 0.09
+    with np.errstate(all="ignore"):
+        found = starts(model, 0, View.whole(recording), theta)
+    assert found
+    assert np.all(np.isfinite(found))
 
 
 def test_equations_that_grow_beyond_all_numbers_are_no_crash(tmp_path: Path) -> None:
