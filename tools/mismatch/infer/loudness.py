@@ -49,7 +49,7 @@ def louder_with(problem: Problem, fitted: Fit, output: str) -> Dependence | None
     residual = fitted.residual[output]
     simulated = problem.measured[output] - residual
     signals = {output: (simulated, "amplitude"), f"{output}'": (np.gradient(simulated), "rate")}
-    signals |= {i: (problem.recording.inputs[i][problem.index], "amplitude") for i in problem.twin.inputs}
+    signals |= {i: (problem.recording.signals[i][problem.index], "amplitude") for i in problem.twin.inputs}
     best, tests = Dependence(output, "amplitude", 1.0, 0.0, False), 0
     for pieces in PIECES:
         samples = residual.size // pieces
