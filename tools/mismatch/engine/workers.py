@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import threading
 import uuid
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing import parent_process
@@ -71,6 +72,8 @@ def spread(function: Callable[..., Any], work: Sequence[tuple[Any, ...]], jobs: 
     client = getattr(get_active_backend()[0], "client", None)
     if client is not None:
         packed = client.submit(np.asarray, packed, key=f"mismatch-shared-{shared.key}")
+    # loky ends a worker whose memory grew, and goes on with a new one: nothing for a person to act on
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     own = ([a for i, a in enumerate(w) if i not in places] for w in work)
     return Parallel(n_jobs=jobs, return_as="generator")(delayed(in_worker)(function, o, shared, packed) for o in own)
 
