@@ -8,7 +8,6 @@ help, read from the source.
 from __future__ import annotations
 
 import ast
-import errno
 import os
 import sys
 from importlib import import_module
@@ -23,6 +22,7 @@ from typer.core import TyperGroup
 from firmware_py.exit_codes import Exit
 from hal.children import SUPERVISED, use_one_thread
 from tools.interrupt import install_handler, was_interrupted
+from tools.output import FULL
 
 
 class Command(NamedTuple):
@@ -240,7 +240,7 @@ def main() -> None:
     try:
         app()
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in FULL:
             raise
         _end(f"standard output: cannot be written ({error.strerror}); free some space", Exit.FAILED)
     except BaseException as end:
