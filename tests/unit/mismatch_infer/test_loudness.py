@@ -10,8 +10,9 @@ from scipy.signal import lfilter
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array
 from tests.unit.mismatch_engine.cases import recording
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.infer import diagnose
-from tools.mismatch.infer.loudness import rank_correlation
+from tools.mismatch.infer.loudness import louder_with, rank_correlation
 
 RATE_HZ = 200.0
 
@@ -58,6 +59,8 @@ def test_a_stiffness_that_sways_is_no_noise_and_slow_noise_is(sways: bool) -> No
     y = y + 0.02 * np.std(left) * rng.standard_normal(u.size)
     parameters = {"A": [[0.0, 1.0], [-900.0, -4.0]], "B": [[0.0], [1.0]], "C": [[1.0, 0.0]], "hold": "zero"}
     rec = recording("state_space", {"u": u}, {"x": y}, parameters, rate_hz=RATE_HZ)
+    problem, _, base = prepared(rec, 0.3, 0, False)
+    assert (louder_with(problem, base, "x") is not None) is sways
     report = diagnose(rec, jobs=1, effects=[EFFECTS[n] for n in ("dead_time", "first_order_lag")])
     assert report.physics == ()
     if sways:
