@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import os
@@ -17,11 +16,8 @@ from typing import Any
 
 from hal.jsonable import to_jsonable
 from hal.trust import allow_name
-from tools.errors import InputError, OutputError
+from tools.errors import FULL, InputError, OutputError
 from tools.interrupt import is_stopped
-
-FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a disk, or of one's share of it, that is full."""
 
 
 def write_text_atomic(path: Path, text: str) -> None:

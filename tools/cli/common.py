@@ -22,9 +22,9 @@ from rich.text import Text
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
 from hal.trust import NotTrusted
-from tools.errors import InputError, OutputError
+from tools.errors import FULL, InputError, OutputError
 from tools.interrupt import begin_command, is_stopped, note_stop
-from tools.output import FULL, check_writable
+from tools.output import check_writable
 from tools.terminal import plain_console
 
 JsonOption = Annotated[

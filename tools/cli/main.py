@@ -21,8 +21,8 @@ from typer.core import TyperGroup
 
 from firmware_py.exit_codes import Exit
 from hal.children import SUPERVISED, use_one_thread
+from tools.errors import FULL
 from tools.interrupt import install_handler, was_interrupted
-from tools.output import FULL
 
 
 class Command(NamedTuple):
