@@ -8,6 +8,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.rigid import centripetal_row, rates, tangential_row
+from sim_devices.physics.statistics import least_squares, thin
 
 _VECTORS = ("specific_force_", "field_")
 
@@ -186,41 +187,62 @@ SOFT_IRON = Effect(
 # -- quadratic cross-axis bias ----------------------------------------------------------------------
 
 
-def _cross_terms(axes: Sequence[str]) -> list[str]:
-    terms = [a + a for a in axes]
-    return terms + ([axes[0] + axes[1]] if len(axes) == 2 else [])
+def _cross_terms(settings: Settings) -> list[str]:
+    """Return the terms by the axes that they multiply: ``yy``, ``zz``, ``yz``, and powers of one, ``yyy``."""
+    axes = _axes(settings)[:2]
+    terms = [a + a for a in axes] + (["".join(axes)] if len(axes) == 2 else [])
+    return terms + [a * d for d in range(3, int(settings.get("degree", (2.0,))[0]) + 1) for a in axes]
+
+
+def _quad_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    """Choose the degree by its fit for the number of columns: IEEE 1293 stops at the square, sensors do not."""
+    k = thin(ctx.keep, 8000)
+    n = max(k.size / 10.0, 20.0)  # effective samples: what is left is coloured, so one in ten counts
+    best: tuple[float, Settings] | None = None
+    for degree in (2.0, 4.0):
+        settings = {**_axis_settings(x, residual, ctx), "degree": (degree,)}
+        cols = _quad_basis(x, ctx, np.empty(0), settings)
+        rss = least_squares(np.column_stack([ctx.line(x, k), cols[k]]), residual[k])[1]
+        score = n * np.log(max(rss, 1e-300)) + cols.shape[1] * np.log(n)
+        if best is None or score < best[0]:
+            best = score, settings
+    assert best is not None
+    return best[1]
+
+
+def _unit(term: str) -> str:
+    return f"{{out}}/{{in}}^{len(term)}"
 
 
 def _quad_parts(settings: Settings) -> Parts:
-    names = _cross_terms(_axes(settings)[:2])
-    return Parts((), tuple(Parameter(f"k_{m}", "{out}/{in}^2", scale=0.01) for m in names), 0.02 * np.eye(len(names)))
+    terms = _cross_terms(settings)
+    return Parts((), tuple(Parameter(f"k_{m}", _unit(m), scale=0.01) for m in terms), 0.02 * np.eye(len(terms)))
 
 
 def _quad_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    axes = _axes(settings)[:2]
     vector = vector_of(ctx.signals)
-    names = _cross_terms(axes)
+    terms = _cross_terms(settings)
     if not vector:
-        return np.zeros((ctx.t.size, len(names)))
-    return np.stack([ctx.signals[vector[m[0]]] * ctx.signals[vector[m[1]]] for m in names], axis=1)
+        return np.zeros((ctx.t.size, len(terms)))
+    return np.stack([np.prod([ctx.signals[vector[a]] for a in m], axis=0) for m in terms], axis=1)
 
 
 def _quad_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    names = _cross_terms(_axes(settings)[:2])
-    return [Human(f"k_{m}", float(v), "{out}/{in}^2") for m, v in zip(names, p, strict=True)]
+    terms = _cross_terms(settings)
+    return [Human(f"k_{m}", float(v), _unit(m)) for m, v in zip(terms, p, strict=True)]
 
 
 CROSS_AXIS_NONLINEARITY = Effect(
     name="cross_axis_nonlinearity",
-    summary="bias that depends quadratically on another axis",
+    summary="bias that depends on powers of another axis, the square first",
     kind="add",
     stages=("sensor",),
     parts=_quad_parts,
-    equation=r"y_i = x_i + \sum_{j, k \ne i} k_{jk} f_j f_k",
-    source="IEEE Std 1293-2018, model equation, terms K_pp, K_oo, K_po",
+    equation=r"y_i = x_i + \sum_{j, k \ne i} k_{jk} f_j f_k + \sum_{j \ne i} (k_{jjj} f_j^3 + k_{jjjj} f_j^4)",
+    source="IEEE Std 1293-2018, model equation, terms K_pp, K_oo, K_po; higher powers where the data ask for them",
     excitation="large values of the other axes while the own axis is small",
     confusable_with=("misalignment", "scale_factor_variation", "centripetal_acceleration"),
-    prepare=_axis_settings,
+    prepare=_quad_settings,
     basis=_quad_basis,
     report=_quad_report,
     driven=False,

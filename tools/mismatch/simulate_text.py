@@ -93,12 +93,14 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
         raise RecordingError(f"{where}: settings must be finite numbers, and {FASTEST} one that is not negative")
     effect = _variant(where, effect, site, settings, given, entry.get("equation"))
     pl = Placed(effect, site, target, cast(Stage, stage), tuple(outputs), settings)
-    names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
-    missing = [n for n in names if not is_finite_number(given.get(n))]
+    parameters = (*pl.parts.nonlinear, *pl.parts.weights)
+    # a file of an earlier version may lack a parameter that has a value without influence
+    values = {p.name: given.get(p.name, p.away) for p in parameters}
+    missing = [n for n, v in values.items() if not is_finite_number(v)]
     if missing:
         raise RecordingError(f"{where}: parameters {', '.join(missing[:5])} missing or not finite numbers")
-    refuse_unknown_keys(f"{where}: parameters:", given, names)
-    return pl, np.array([float(given[n]) for n in names])
+    refuse_unknown_keys(f"{where}: parameters:", given, values)
+    return pl, np.array([float(v) for v in values.values()])
 
 
 def _variant(

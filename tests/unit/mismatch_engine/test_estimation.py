@@ -12,6 +12,7 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, stack, wave
+from tools.errors import RecordingError
 from tools.mismatch import notebook
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import fit, fit_base, moved_a_little, slopes
@@ -30,6 +31,7 @@ from tools.mismatch.infer.search import look
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_start import prepare
+from tools.mismatch.simulate_view import view_run
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.opaque import opaque_twin
 
@@ -223,3 +225,48 @@ def test_a_derivative_that_diverged_is_left_out_of_a_regression(diverged: float)
     one, y = rng.standard_normal((50, 1)), rng.standard_normal(50)
     wide = np.column_stack([one, np.full(50, diverged)])
     assert Regression([wide]).less(y) == pytest.approx(Regression([one]).less(y))
+
+
+def lever(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+    """Micrometres out of volts, bent by the angle, and refused beyond the stop."""
+    if np.max(np.abs(inputs["u"])) > parameters["stop"]:
+        raise RecordingError("made here: beyond the stop")
+    return {"y": parameters["arm"] * np.sin(parameters["turn"] * inputs["u"])}
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_change_goes_through_a_program_as_its_derivative_says(refused: bool) -> None:
+    rng = np.random.default_rng(6)
+    u = np.clip(wave(rng, N), -1.0, 1.0)
+    stop = float(np.max(np.abs(u))) + (0.001 if refused else 0.1)
+    given: dict[str, object] = {"arm": 260.0, "turn": 1.1, "stop": stop}
+    rec = recording("own", {"u": u}, {"y": 260.0 * np.sin(1.1 * u)}, given)
+    problem = own_problem(rec, lever)
+    run = view_run(problem.twin, problem.view)
+    carry = problem.twin.through(run, "u", np.array([260.0, 1.1, stop]), "y")
+    assert carry is not None
+    assert not np.any(carry(np.zeros(N)))
+    change = 20.0 * (1.5 + np.cos(0.02 * np.arange(N))) * np.sign(u)
+    expected = 286.0 * np.cos(1.1 * u) * change
+    if refused:  # what the program refuses moves nothing
+        expected = np.zeros(N)
+    np.testing.assert_allclose(carry(change), expected, atol=0.02 * 286.0 * 50.0 * bool(np.any(expected)))
+
+
+def test_a_slow_command_of_a_bent_program_is_creep_before_it() -> None:
+    """The weights of an effect at the input are in volts; the mismatch is in micrometres."""
+    rng = np.random.default_rng(2)
+    dt, step = 0.01, rng.uniform(-0.9, 0.9, 12)
+    u = np.repeat(step, 200)
+    slow = np.convolve(np.diff(u, prepend=u[0]), np.log10(1.0 + np.arange(u.size) * dt / 0.05))[: u.size]
+
+    def simulate(inputs: Mapping[str, Array], parameters: Mapping[str, float], dt: float) -> Array:
+        return parameters["arm"] * np.sin(parameters["turn"] * inputs["u"])
+
+    lift = 260.0 * np.sin(1.1 * (u + 0.05 * slow)) + 0.5 * rng.standard_normal(u.size)
+    rec = notebook.Recording({"u": u}, {"lift": lift}, dt).with_twin(
+        notebook.Twin(simulate, {"arm": 255.0, "turn": 1.12})
+    )
+    report = diagnose(rec, effects=[EFFECTS[n] for n in ("creep", "backlash", "hysteresis", "static_nonlinearity")])
+    assert [(p.name, p.site) for p in report.physics] == [("creep", "input")]
+    assert report.verdict == "missing_physics"

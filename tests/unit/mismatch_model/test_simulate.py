@@ -222,6 +222,14 @@ def test_bursts_are_excused() -> None:
         ({"name": "creep", "site": "feedback", "target": "displacement"}, "cannot sit at 'feedback'"),
         ({"name": "creep", "target": "nowhere"}, "outputs .* are not among displacement"),
         ({"name": "backlash", "target": "displacement"}, "half_gap, missing_slope missing"),
+        (
+            {
+                "name": "backlash",
+                "target": "displacement",
+                "parameters": {"half_gap": 0.1, "missing_slope": 1.0, "first_in_gap": "left"},
+            },
+            "parameters first_in_gap missing or not finite",
+        ),
     ],
 )
 def test_bad_corrected_twins(entry: dict[str, object], message: str) -> None:

@@ -177,3 +177,18 @@ def test_compiled_equals_python(kernel: Callable[..., Array], args: tuple[object
 def test_short_and_long_steps_of_smooth_elements_are_one_formula() -> None:
     y = np.concatenate([np.geomspace(1e-9, 0.03, 200), np.linspace(0.03, 5.0, 50)])
     assert [risen(v) for v in y] == pytest.approx(-np.expm1(-y), rel=1e-14)
+
+
+@pytest.mark.parametrize("first", [-1.0, 0.0, 0.4])
+def test_a_gap_begins_where_it_was_left(first: float) -> None:
+    """The play is moved by the contact that comes first; until then the signal moves alone."""
+    x = np.concatenate([np.linspace(2.0, 3.0, 101), np.linspace(3.0, -1.0, 401)])
+    effect = EFFECTS["backlash"]
+    assert effect.basis is not None
+    t = 0.01 * np.arange(x.size)
+    gone = -effect.basis(x, context(t, x, x), np.array([0.3, first]), {"span": (4.0,)})[:, 0]
+    still = x < 2.0 + 0.3 * (1.0 - first)
+    up = still & (t <= 1.0)
+    np.testing.assert_allclose(gone[up], x[up] - 2.0 + 0.3 * first, atol=1e-12)
+    np.testing.assert_allclose(gone[(t <= 1.0) & ~still], 0.3, atol=1e-12)
+    np.testing.assert_allclose(gone[-1], -0.3, atol=1e-12)

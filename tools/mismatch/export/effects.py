@@ -256,7 +256,7 @@ def _creep(s: Slot, x: str, d: str) -> str:
 
 
 def _backlash(s: Slot, x: str, d: str) -> str:
-    play = s.part("stops", f"[{s.at('half_gap')}], {numbers(s.setting('rest'))}")
+    play = s.part("stops", f"[{s.at('half_gap')}], first={s.at('first_in_gap')}")
     return f"{x} - {s.at('missing_slope')} * {play}({d})[:, 0]"
 
 
@@ -352,7 +352,7 @@ def _here(s: Slot) -> dict[str, str]:
 
 def _cross_axis(s: Slot, x: str, d: str) -> str:
     vector = _axes(s)
-    return x + "".join(f" + {s.at(n)} * {vector[n[-2]]} * {vector[n[-1]]}" for n in s.values)
+    return x + "".join(f" + {s.at(n)} * {' * '.join(vector[a] for a in n.removeprefix('k_'))}" for n in s.values)
 
 
 def _scale_variation(s: Slot, x: str, d: str) -> str:

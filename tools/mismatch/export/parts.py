@@ -67,15 +67,19 @@ def resample(first, step, bend, cubic):
     return run
 
 
-def stops(radii, rest):
-    """Stop operators E = x - P of plays P = max(x - r, min(x + r, P)) (Kuhnen 2003, eq. 2), (n, elements)."""
+def stops(radii, rest=None, first=0.0):
+    """Stop operators E = x - P of plays P = max(x - r, min(x + r, P)) (Kuhnen 2003, eq. 2), (n, elements).
+
+    P begins at ``rest``, else so that E begins at ``first`` r."""
     radii = np.asarray(radii)
-    play = np.full(len(radii), float(rest))
+    play = None if rest is None else np.full(len(radii), float(rest))
 
     def run(x):
         nonlocal play
         out = np.empty((len(x), len(radii)))
         for k, v in enumerate(x):
+            if play is None:
+                play = v - np.clip(first, -1, 1) * radii
             play = np.maximum(v - radii, np.minimum(v + radii, play))
             out[k] = v - play
         return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +37,10 @@ class UserTwin(Protocol):
         """Make a free run."""
         ...
 
+
+SMALL = 0.01
+"""Size of a change whose effect is a difference of two runs, as a share of the range of the input: solvers of foreign
+programs are exact to 1e-4 or so."""
 
 Call = Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]]
 
@@ -82,18 +87,46 @@ class OpaqueTwin:
         """See Twin."""
         return 1.0
 
-    def through(self, run: Run, signal: str, theta: Array, output: str) -> None:
-        """See Twin."""
-        return None
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array] | None:
+        """See Twin: the inside is unknown, so a change is carried by the difference of two runs."""
+        if signal not in self.inputs:
+            return None
+        held = {s: Signal(run.signals[s], {}, (s,)) for s in self.inputs}
+        u, row = run.signals[signal], self.outputs.index(output)
+        here, small = self._simulated(run, held, theta)[row], SMALL * (float(np.ptp(u)) or 1.0)
+
+        def carry(change: Array) -> Array:
+            most = float(np.max(np.abs(change)))
+            if not 0.0 < most < np.inf:
+                return np.zeros_like(change)
+            share = small / most
+            token = (signal, "moved", blake2b(change.tobytes()).digest())
+            try:
+                moved = self._simulated(run, held | {signal: Signal(u + share * change, {}, token)}, theta)[row]
+            except RecordingError:
+                return np.zeros_like(change)
+            return np.nan_to_num((moved - here) / share, nan=0.0, posinf=0.0, neginf=0.0)
+
+        return carry
 
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
         """See Twin."""
         used = {s: fold(x, theta) for s, x in inputs.items()}
-        values = dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=False)}
-        key = ("opaque", tuple(x.token for x in used.values()), tuple(values[k] for k in self.free))
+        stacked, key = self._simulated(run, used, theta), self._key(used, theta)
+        return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
 
+    def _values(self, theta: Array) -> dict[str, Any]:
+        return dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=False)}
+
+    def _key(self, used: Mapping[str, Signal], theta: Array) -> tuple[object, ...]:
+        values = self._values(theta)
+        return ("opaque", tuple(x.token for x in used.values()), tuple(values[k] for k in self.free))
+
+    def _simulated(self, run: Run, used: Mapping[str, Signal], theta: Array) -> Array:
+        """Return the outputs (outputs, n) of a run with the inputs ``used``; NaN if the program refuses ``theta``."""
+        values = self._values(theta)
         as_given = all(values[k] == float(self.given[k]) for k in self.free)
 
         def make() -> Array:
@@ -105,8 +138,7 @@ class OpaqueTwin:
                 # the valid values of a foreign program are unknown; a search that leaves them is reversed
                 return np.full((len(self.outputs), run.t.size), np.nan)
 
-        stacked = remember(run.memo, key, make)
-        return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
+        return remember(run.memo, self._key(used, theta), make)
 
     def _checked(self, found: Mapping[str, Array], t: Array) -> Array:
         """Return outputs (outputs, n). Raises RecordingError if one is missing, not finite or not as long as ``t``."""
