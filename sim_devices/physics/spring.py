@@ -64,6 +64,7 @@ _CUBIC = Effect(
     fill=lambda q, w, settings: packed("spring", SPRING, dict(enumerate(w))),
     report=_spring_report,
     vanishes_with=(("cubic_stiffness", "quadratic_stiffness", "quintic_stiffness"),),
+    acts_on=("motion", "joint"),
 )
 
 
