@@ -59,7 +59,7 @@ def coherent_with(problem: Problem, fitted: Fit, output: str) -> Dependence | No
     inside = _inside(problem)
     # white, neither rings from segment to segment nor leaks from one bin into the others
     residual = whiten(fitted.residual[output], inside, ORDER)
-    best, tests = Dependence(output, "value", 1.0, 0.0, False), 0
+    best, tests = Dependence(output, "value", 1.0, 0.0, True), 0
     for name, feature, curve in _moving(problem, fitted):
         signal = whiten(curve, inside, ORDER)
         for segments in SEGMENTS:
@@ -68,7 +68,7 @@ def coherent_with(problem: Problem, fitted: Fit, output: str) -> Dependence | No
             tests += 1
             share, p = coherence(signal, residual, segments)
             if p < best.p_value:
-                best = Dependence(name, feature, p, share, feature == "recent history")
+                best = Dependence(name, feature, p, share, True)
     p = min(1.0, best.p_value * tests)
     return replace(best, p_value=p) if p < LEAST_P else None
 
@@ -83,15 +83,12 @@ def _inside(problem: Problem) -> NDArray[np.bool_]:
 
 
 def _moving(problem: Problem, fitted: Fit) -> Iterator[tuple[str, str, Array]]:
-    """Yield (name, feature, curve (m,)) of the inputs and the simulated outputs.
-
-    A path without a curve has a history alone. Friction and drag have the sign and the square of a rate.
-    """
+    """Yield (name, feature, curve (m,)) of inputs and simulated outputs; friction and drag follow the rates."""
     inputs = {s: problem.recording.signals[s][problem.index] for s in problem.twin.inputs}
     outputs = {o: problem.measured[o] - fitted.residual[o] for o in problem.twin.outputs}
     for name, signal in (*inputs.items(), *outputs.items()):
         x = signal - signal.mean()
-        yield from ((name, "recent history", x), (name, "square", x**2), (name, "value", x**3))
+        yield from ((name, "value", x), (name, "square", x**2), (name, "value", x**3))
         if name in outputs:
             rate = np.gradient(x)
-            yield from ((name, "sign of rate", np.sign(rate)), (name, "rate", rate * np.abs(rate)))
+            yield from ((name, "rate", np.sign(rate)), (name, "rate", rate * np.abs(rate)))
