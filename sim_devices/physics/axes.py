@@ -184,7 +184,7 @@ SOFT_IRON = Effect(
     vanishes_with=(("x?", "y?"),),
 )
 
-# -- quadratic cross-axis bias ----------------------------------------------------------------------
+# -- bias by powers of another axis -----------------------------------------------------------------
 
 
 def _cross_terms(settings: Settings) -> list[str]:
@@ -195,7 +195,7 @@ def _cross_terms(settings: Settings) -> list[str]:
 
 
 def _quad_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    """Choose the degree by its fit for the number of columns: IEEE 1293 stops at the square, sensors do not."""
+    """Choose the degree, 2 as in IEEE 1293 or 4, by Schwarz's criterion (Ann. Stat. 6, 1978)."""
     k = thin(ctx.keep, 8000)
     n = max(k.size / 10.0, 20.0)  # effective samples: what is left is coloured, so one in ten counts
     best: tuple[float, Settings] | None = None

@@ -25,7 +25,7 @@ def _parts(settings: Settings) -> Parts:
 
 
 def in_gap(x: Array, half_gaps: Array, first: float, starts: tuple[int, ...]) -> Array:
-    """Return the way x - P_r[x] (n, k) of x from the middle of each gap, which begins at ``first`` half gaps."""
+    """Return the distance x - P_r[x] (n, k) of x from the middle of each gap, ``first`` half gaps at each start."""
     out = np.empty((x.size, half_gaps.size))
     for a, b in pairwise((*starts, x.size)):
         for j, r in enumerate(half_gaps):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+import numba
 import numpy as np
 from scipy.signal import lfilter
 
@@ -158,3 +159,18 @@ def named(made: Recording, names: Iterable[str]) -> set[str]:
 def among(*sets: Scored) -> Callable[[Store, Sequence[Out]], list[Scored]]:
     """Return what accepts these sets."""
     return lambda store, gone: [s for s in sets if not any(g(s) for g in gone)]
+
+
+@numba.njit
+def swung(u: Array, rate_hz: float, rate_rad_s: float = 30.0, damping: float = 4.0, sway: float = 0.0) -> Array:
+    """Return the course (n,) of x'' = u - damping x' - rate^2 (1 + sway cos 90 t) x, in 20 steps a sample."""
+    out = np.empty(u.size)
+    h = 1.0 / (rate_hz * 20)
+    x, v, t = 0.0, 0.0, 0.0
+    for k in range(u.size):
+        out[k] = x
+        for _ in range(20):
+            v += h * (u[k] - damping * v - rate_rad_s**2 * (1.0 + sway * np.cos(90.0 * t)) * x)
+            x += h * v
+            t += h
+    return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import bouc_wen, named, recording, wave
@@ -111,3 +112,18 @@ def test_what_a_louder_output_hid_is_looked_at_again() -> None:
     rec = recording("accelerometer", inputs, outputs, parameters, rate_hz=100.0)
     rivals = ("random_walk", "scale_factor_variation", "cross_axis_nonlinearity", "creep", "hysteresis", "resonance")
     assert found(rec, "misalignment", *rivals) == {"misalignment"}
+
+
+def test_a_bias_with_the_fourth_power_of_another_axis_is_one_effect() -> None:
+    """The square alone leaves a curve that looked like one of the own axis."""
+    rng = np.random.default_rng(9)
+    x, y = wave(rng), wave(rng)
+    volts = 1.65 + 0.3 * x + 0.02 * y**2 + 0.01 * y**4
+    outputs = {"voltage_x": volts + 2e-4 * rng.standard_normal(x.size)}
+    inputs = {"specific_force_x": x, "specific_force_y": y}
+    rec = recording("accelerometer", inputs, outputs, {"bias_V": 1.65, "scale_V_per_g": 0.3})
+    names = ("cross_axis_nonlinearity", "static_nonlinearity", "scale_factor_variation")
+    report = diagnose(rec, jobs=1, effects=[EFFECTS[n] for n in names])
+    (found,) = report.physics
+    assert found.name == "cross_axis_nonlinearity"
+    assert found.parameters["k_yyyy"].value == pytest.approx(0.01, rel=0.05)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.effect import Array
-from tests.unit.mismatch_engine.cases import recording
+from tests.unit.mismatch_engine.cases import recording, swung
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer.loudness import louder_with, rank_correlation
@@ -33,26 +31,11 @@ def test_a_series_is_wholly_like_itself_and_unlike_its_negative() -> None:
     assert rank_correlation(np.ones(128), a) == (0.0, 1.0)
 
 
-@numba.njit
-def swung(u: Array, sway: float) -> Array:
-    """Return the course (n,) of x'' = u - 4 x' - 900 (1 + sway cos 90 t) x, in 20 steps a sample."""
-    out = np.empty(u.size)
-    h = 1.0 / (RATE_HZ * 20)
-    x, v, t = 0.0, 0.0, 0.0
-    for k in range(u.size):
-        out[k] = x
-        for _ in range(20):
-            v += h * (u[k] - 4.0 * v - 900.0 * (1.0 + sway * np.cos(90.0 * t)) * x)
-            x += h * v
-            t += h
-    return out
-
-
 @pytest.mark.parametrize("sways", [True, False])
 def test_a_stiffness_that_sways_is_no_noise_and_slow_noise_is(sways: bool) -> None:
     rng = np.random.default_rng(3)
     u = np.repeat(rng.uniform(-1.0, 1.0, 300), 20) * np.repeat(rng.uniform(0.2, 2.0, 10), 600)
-    plain, other = swung(u, 0.0), swung(u, 0.35)
+    plain, other = swung(u, RATE_HZ), swung(u, RATE_HZ, sway=0.35)
     left = other - plain
     noise = lfilter([1.0, 0.0], [1.0, -1.9, 0.95], rng.standard_normal(u.size))  # rings like the plant
     y = other if sways else plain + noise * np.std(left) / np.std(noise)

@@ -17,7 +17,7 @@ from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import LEAST_LEAD, Leftover, Stranger, about, lead, leftover
 from tools.mismatch.infer.borne_out import Out, borne_out, doubts_of, entry_of
-from tools.mismatch.infer.coherence import coherent_with
+from tools.mismatch.infer.causes import caused_by
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
 from tools.mismatch.infer.loudness import louder_with
@@ -418,11 +418,11 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
         coloured = rest_of(p, final.fitted, of_any_colour=True)
         if is_whole(*worst_left(p, store.base.fitted, coloured, doubt=False), c):
             loudest = tuple(o for o, (_, hi) in coloured.floors.items() if hi > rest.floors[o][1])
-            moved = ((o, louder_with(p, coloured.fit, o) or coherent_with(p, coloured.fit, o)) for o in loudest)
+            moved = ((o, louder_with(p, coloured.fit, o) or caused_by(p, coloured.fit, o)) for o in loudest)
             known = {o: d for o, d in moved if d is not None}
             if not known:
                 return Judged(final, coloured, True, loudest, False)
-            # noise is neither louder where the simulation moves more, nor coherent with what moves
+            # noise is neither louder where the simulation moves more, nor predicted by the past of what moves
             left = {
                 o: replace(v, follows=(known[o], *v.follows), real=True) if o in known else v
                 for o, v in rest.left.items()
