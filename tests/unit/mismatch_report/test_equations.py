@@ -35,7 +35,8 @@ def test_base_equations_are_type(tex: str):
         (r"\sum_{j \ne i} m_{ij} f_j", "Σ_(j≠i) mᵢⱼ fⱼ"),
         (r"\sigma_i\,x,\; r_i \ll 1", "σᵢ x,  rᵢ ≪ 1"),
         (r"\Delta\,\mathrm{round}(x/\Delta)", "Δ round(x/Δ)"),
-        (r"\sum_{d \ge 2} c \quad\text{or}\quad 1", "Σ_(d≥2) c   or   1"),
+        (r"\dot h = \dots - a \sqrt{h_i - e}", "h\u0307 = … - a √(hᵢ - e)"),
+        (r"\sqrt{g} \sum_{d \ge 2} c \quad\text{or}\quad 1", "√g Σ_(d≥2) c   or   1"),
     ],
 )
 def test_plain(tex: str, text: str):

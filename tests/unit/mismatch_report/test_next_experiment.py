@@ -36,6 +36,17 @@ def test_unexplained_asks_for_the_signal_that_it_follows():
     assert "follows no recorded signal" in said(replace(unexplained(), location=nothing))[0]
 
 
+def test_an_output_that_it_follows_is_reached_by_way_of_the_inputs():
+    r = unexplained()
+    (output,) = r.fit.unit
+    by_output = replace(r.location, depends_on=(DependsOn(output, "recent history", 0.5),))
+    assert said(replace(r, location=by_output))[0].startswith(f"by way of the inputs, a step of {output}")
+
+
+def test_a_slow_recording_is_not_asked_for_seconds_at_rest():
+    assert any(s.startswith("a thousand samples with the input at rest") for s in said(missing_physics()))
+
+
 def test_agrees_names_what_it_could_not_have_seen():
     want = "amplitudes that reach the limits, and smaller ones for comparison: shows saturation, which this"
     assert [s.startswith(want) for s in said(agrees())] == [True]

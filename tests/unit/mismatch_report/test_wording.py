@@ -139,3 +139,11 @@ def test_a_rest_that_follows_nothing_is_not_said_to_be_above_a_known_floor() -> 
     assert wording.meaning(report).startswith("the noise floor is known well enough")
     alone = replace(report, location=replace(report.location, depends_on=()))
     assert "follows no recorded signal" in wording.meaning(alone)
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.0, "0 %"), (0.00102, "0.1 %"), (0.0096, "1 %"), (0.366, "37 %"), (6.157, "616 %"), (1.3e25, "1.3e+27 %")],
+)
+def test_a_share_is_neither_nothing_nor_a_row_of_digits(share: float, text: str) -> None:
+    assert wording.percent(share) == text

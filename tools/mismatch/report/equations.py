@@ -21,6 +21,8 @@ def plain(tex: str) -> str:
     text = re.sub(r"\\quad", "   ", text)
     text = re.sub(r"\\(?:mathrm|text)\{([^{}]*)\}", r"\1", text)
     text = re.sub(r"\\[,;! ]", " ", text)
+    text = re.sub(r"\\dots(?![A-Za-z])", "…", text)  # before the accents, which would read it as a dotted s
+    text = re.sub(r"\\sqrt\s*\{([^{}]*)\}", r"√(\1)", re.sub(r"\\sqrt\s*\{(\w)\}", r"√\1", text))
     for accent, mark in _ACCENTS.items():
         text = re.sub(rf"\\{accent}\s*(\\?[A-Za-z])", lambda m, k=mark: _name(m[1]) + k, text)
     text = re.sub(r"\\([A-Za-z]+)", lambda m: _WORDS.get(m[1], m[1]), text)

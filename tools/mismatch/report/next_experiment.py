@@ -53,7 +53,7 @@ def next_experiments(report: Report) -> list[Experiment]:
     if estimated:
         found.append(
             Experiment(
-                "ten seconds with the input at rest, and noise_rms in the recording",
+                "a thousand samples with the input at rest, and noise_rms in the recording",
                 f"the noise floor of {', '.join(estimated)} was estimated, not declared",
             )
         )
@@ -71,7 +71,7 @@ def next_experiments(report: Report) -> list[Experiment]:
 
 
 def _unexplained(report: Report) -> list[Experiment]:
-    out = [_follow(d) for d in report.location.depends_on[:2]]
+    out = [_follow(d, report) for d in report.location.depends_on[:2]]
     return out or [
         Experiment(
             "the same input twice, and every signal near the instrument as a context channel",
@@ -80,8 +80,10 @@ def _unexplained(report: Report) -> list[Experiment]:
     ]
 
 
-def _follow(d: DependsOn) -> Experiment:
+def _follow(d: DependsOn, report: Report) -> Experiment:
     what = _FOLLOWS.get(d.feature, "excite {s} alone, over its whole range").format(s=d.signal)
+    if d.signal in report.fit.unit:  # nobody sets an output
+        what = f"by way of the inputs, {what}"
     return Experiment(what, f"draws the curve of what follows {d.signal} ({d.feature})")
 
 

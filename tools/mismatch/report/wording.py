@@ -25,8 +25,8 @@ VERDICTS: Mapping[str, str] = {
     "unexplained": "Unexplained",
 }
 MEANINGS: Mapping[str, str] = {
-    "floor_doubtful": "the noise floor is in doubt: at its upper end nothing is left. Record ten seconds with the input"
-    " at rest, repeat the input, or declare noise_rms or tolerance",
+    "floor_doubtful": "the noise floor is in doubt: at its upper end nothing is left. Record a thousand samples with"
+    " the input at rest, repeat the input, or declare noise_rms or tolerance",
     "fit_failed": "the fit failed, so this says nothing about physics yet. Look at the parameters as given, the units"
     " and the start of the record",
     "place_not_reachable": "this kind of twin can be changed at its inputs and outputs only, and what is left may sit"
@@ -42,8 +42,8 @@ IMITATED = (
 """Meaning of ``place_not_reachable`` where the named effects leave nothing."""
 FOLLOWS_NOTHING = (
     "the fit holds and every place of this twin was tried, but what is left follows no recorded signal. It may be slow"
-    " noise, a disturbance that is not recorded, or several effects at once: ten seconds with the input at rest show"
-    " what is there without the input"
+    " noise, a disturbance that is not recorded, or several effects at once: a thousand samples with the input"
+    " at rest show what is there without the input"
 )
 """Meaning of ``unknown`` where the residual depends on nothing that was recorded."""
 UNSURE = 0.75
@@ -87,8 +87,11 @@ def shown_in(fit: FitSummary, output: str, typical: float) -> tuple[float, str]:
 
 
 def percent(share: float | None) -> str:
-    """Return a share as a percentage, '-' for an unknown one."""
-    return "-" if share is None or not math.isfinite(share) else f"{100 * share:.0f} %"
+    """Return a share as a percentage, '-' for an unknown one: a digit below 1 %, no more than three above 10 000 %."""
+    if share is None or not math.isfinite(share):
+        return "-"
+    size = abs(100 * share)
+    return f"{100 * share:{'.0f' if size == 0 or 0.95 <= size < 1e4 else '.1g' if size < 1 else '.3g'}} %"
 
 
 def words(name: str) -> str:
