@@ -69,6 +69,47 @@ def test_a_heated_block(tmp_path: Path):
     assert "outputs are 'block_degC'" in found.assumed
 
 
+def test_a_temperature_answers_where_nothing_else_could(tmp_path: Path):
+    t = np.arange(300.0)
+    header = "time (s),heater power (W),ambient (degC),block temperature (degC)"
+    found = guess(table(tmp_path, header, t, np.sin(t), 20 + 0.1 * t, 30 + np.cos(t)))
+    assert [c.role for c in found.columns] == ["time", "input", "context", "output"]
+    assert "outputs are 'block temperature (degC)'" in found.assumed
+
+
+def test_columns_that_neither_drive_nor_answer_are_named_with_what_to_do(tmp_path: Path):
+    t = np.arange(300.0)
+    with pytest.raises(RecordingError, match=r"room \(degC\), supply \(V\); begin the name of one with 'input'"):
+        guess(table(tmp_path, "time (s),room (degC),supply (V)", t, np.sin(t), np.cos(t)))
+
+
+@pytest.mark.parametrize("simulated", ["sim_angle_deg", "angle_deg_simulated", "simulated_angle [rad]"])
+def test_a_simulated_column_is_the_course_of_its_output(tmp_path: Path, simulated: str):
+    """``micron mismatch simulate --out`` writes the second of these names."""
+    t = np.arange(300) / 100.0
+    data = table(tmp_path, f"t_s,torque_mNm,angle_deg,{simulated}", t, np.sin(t), np.cos(t), 0.9 * np.cos(t))
+    made = new_recording(data, kind="columns")
+    assert [(c.role, c.signal) for c in made.guess.columns[1:]] == [
+        ("input", "torque"), ("output", "angle"), ("input", "simulated_angle"),
+    ]  # fmt: skip
+    assert made.guess.columns[3].unit == ("rad" if "[rad]" in simulated else "deg")
+    assert not made.guess.unknown
+    assert load(made.path).twin.kind == "columns"
+
+
+def test_an_output_without_a_simulated_course_is_asked_for(tmp_path: Path):
+    t = np.arange(300) / 100.0
+    data = table(tmp_path, "t_s,pump_V,level [mm],sim_height [mm]", t, np.sin(t), np.cos(t), np.cos(t))
+    (text,) = new_recording(data, kind="columns").guess.unknown
+    assert 'output \'level\': its column needs role = "input" and signal = "simulated_level"' in text
+
+
+def test_a_twin_that_nothing_tells_is_asked_for_with_the_two_of_ones_own(tmp_path: Path):
+    t = np.arange(300.0)
+    found = guess(table(tmp_path, "t_s,pump [l/min],level [mm]", t, np.sin(t), np.cos(t)))
+    assert "--twin ode (your equations as text), --twin columns" in found.unknown[0]
+
+
 def test_a_twin_that_units_alone_suggest_is_an_assumption(tmp_path: Path):
     t = np.arange(300.0)
     found = guess(table(tmp_path, "t_s,valve_V,stroke_mm", t, np.sin(t), np.cos(t)))

@@ -21,7 +21,16 @@ import numpy as np
 
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
-from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit, word
+from tools.mismatch.guess_roles import (
+    Assignment,
+    GuessedRole,
+    Parts,
+    assign,
+    choose_kinds,
+    simulated_courses,
+    split_unit,
+    word,
+)
 from tools.mismatch.recording_columns import (
     Array,
     column_names,
@@ -140,14 +149,27 @@ def guess(path: Path, kind: str = "") -> Guess:
     given = kind
     kinds = [kind] if kind else choose_kinds(left, parts)
     kind = kinds[0] if len(kinds) == 1 else ""
+    if kind == "columns":  # the unit of a simulated course is that of its output, where its name has none
+        courses = simulated_courses(left, parts)
+        parts |= {k: parts[of] for k, of in courses.items() if of and not parts[k][1]}
     found = assign(kind, left, parts)
     if found is None and given and not _is_open(given):
         raise RecordingError(f"{path}: no columns are an input and an output of a {given}; {_words_of(given)}")
     if found is None:
-        raise RecordingError(f"{path}: nothing but context beside the time; rename what drives and what answers")
+        raise RecordingError(
+            f"{path}: no column tells by name or unit that it drives or answers: {', '.join(left)}; begin the name of"
+            " one with 'input' and of another with 'output'"
+        )
     notes += found.notes
     assumed += found.assumed
     unknown = [] if kind else [_no_kind(kinds, left, parts, found)]
+    if kind == "columns":
+        outputs = [found.signals[k] for k in left if found.roles[k] == "output"]
+        unknown += [
+            f'the simulated course of output \'{o}\': its column needs role = "input" and signal = "simulated_{o}"'
+            for o in outputs
+            if f"simulated_{o}" not in found.signals.values()
+        ]
     if kind and not given and not any(word(parts[k][0]) == found.signals.get(k) for k in left):
         assumed.append(f"the twin is a {kind}, by its units alone; for another repeat with --twin KIND")
     bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
@@ -332,7 +354,8 @@ def _no_kind(kinds: Sequence[str], left: Sequence[str], parts: Parts, found: Ass
     }
     return (
         f"the twin: no kind is told by {', '.join(by_role['input'])} in and {', '.join(by_role['output'])} out;"
-        f" set its kind, or repeat with --twin KIND ({', '.join(KINDS)})"
+        " set its kind, or repeat with --twin ode (your equations as text), --twin columns (the file holds simulated"
+        f" columns, too) or another KIND ({', '.join(k for k in KINDS if k not in ('ode', 'columns'))})"
     )
 
 

@@ -26,6 +26,9 @@ _WORDS: tuple[tuple[GuessedRole, str], ...] = (
     ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
     ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|kraft"),
 )
+_SURROUNDINGS = r"supply|ambient|room|humid|status|flag|state"
+"""Names of context that stay context where no other column could answer."""
+_SIMULATED = re.compile(r"^(?:sim(?:ulated)?_(?P<behind>.+)|(?P<before>.+)_sim(?:ulated)?)$", re.IGNORECASE)
 _LETTERS: tuple[tuple[GuessedRole, str], ...] = (("input", r"u(\d|_|[A-Z]|$)"), ("output", r"y(\d|_|[A-Z]|$)"))
 """The letters of system identification: ``u``, ``u1``, ``uEst``, ``y_val``."""
 _BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
@@ -108,7 +111,7 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
     """
     words = vocabulary(kind) if kind else None
     if words is None or words.open_ended:
-        return _assign_freely(names, parts)
+        return _assign_freely(kind, names, parts)
     found = _Places(kind, parts)
     hints: dict[str, GuessedRole] = {name: role_of_name(parts[name][0]) for name in names}
     for name in names:  # the twin's own words
@@ -224,14 +227,34 @@ class _Places:
         )  # fmt: skip
 
 
-def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
+def simulated_courses(names: Sequence[str], parts: Parts) -> dict[str, str]:
+    """Return the columns of simulated output, by name (``sim_x_mm``), each with the column of that output (``x_mm``).
+
+    The output is empty where no column has the rest of the name.
+    """
+    found: dict[str, str] = {}
+    by_word = {word(parts[name][0]).lower(): name for name in names} | {word(name).lower(): name for name in names}
+    for name in names:
+        for own in (word(parts[name][0]), word(name)):  # 'x_mm_simulated' has its unit inside
+            match = _SIMULATED.match(own)
+            if match is not None:
+                found[name] = found.get(name) or by_word.get((match["behind"] or match["before"]).lower(), "")
+    return found
+
+
+def _assign_freely(kind: str, names: Sequence[str], parts: Parts) -> Assignment | None:
     """Assign roles for a twin that takes any signal: by name, else the first column drives and the others answer."""
     roles: dict[str, GuessedRole] = {name: guess_role(*parts[name]) for name in names}
+    courses = simulated_courses(names, parts) if kind == "columns" else {}
+    simulated = {name: output for name, output in courses.items() if output}
+    roles |= {name: "input" if output else "context" for name, output in courses.items()}
+    roles |= dict.fromkeys(simulated.values(), "output")
     used = [name for name in names if roles[name] != "context"]
-    if len(used) < 2:  # a heater: the last temperatures are no context, unless a name says so
-        by_unit = [name for name in names if roles[name] == "context" and not role_of_name(parts[name][0])]
-        roles |= dict.fromkeys(by_unit[len(used) - 2 :], "")
-        used = [name for name in names if roles[name] != "context"]
+    for asides in (_WORDS[0][1], _SURROUNDINGS):  # a heater: the last temperatures are no context, unless named so
+        if len(used) < 2:
+            inside = [k for k in names if roles[k] == "context" and not re.search(asides, parts[k][0], re.IGNORECASE)]
+            roles |= dict.fromkeys(inside[len(used) - 2 :], "")
+            used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
     named_roles = dict(roles)
@@ -248,6 +271,8 @@ def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
         plain, unit = parts[name]
         own = _context_signal(plain, unit) if roles[name] == "context" else word(plain)
         signals[name] = _unused(own, signals)
+    for name, output in simulated.items():
+        signals[name] = f"simulated_{signals[output]}"
     return Assignment(roles, signals, sum(bool(guess_role(*parts[k])) for k in used), (), tuple(assumed))
 
 
