@@ -363,7 +363,8 @@ def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
     try:
         return EmulationConfig.model_validate(table)
     except ValidationError as error:
-        raise BenchError(describe_validation_error(error, "[emulation]")) from error
+        bench = f"bench '{description['name']}': " if description.get("name") else ""
+        raise BenchError(describe_validation_error(error, f"{bench}[emulation]")) from error
 
 
 def _follow_output(amplifier: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

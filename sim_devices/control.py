@@ -66,9 +66,12 @@ class WorldControl:
     def answer(self, line: bytes) -> bytes:
         """Do the order in ``line``, a JSON object, and return the answer as JSON."""
         try:
-            order = json.loads(line)
+            try:
+                order = json.loads(line)
+            except ValueError as error:
+                raise ValueError(f"an order is one JSON object on a line, and this is no JSON: {error}") from error
             if not isinstance(order, dict):
-                raise ValueError("an order is a JSON object")
+                raise ValueError("an order is one JSON object on a line")
             known = [name for name in self._orders if name in order]
             if len(known) != 1:
                 raise ValueError(f"an order has one of {', '.join(self._orders)}")
@@ -93,6 +96,8 @@ class WorldControl:
         return {"truth": {name: np.asarray(value).tolist() for name, value in self._world.plant.truth_row().items()}}
 
     def _set(self, order: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(order["set"], dict):
+            raise ValueError('set takes an object with a value for each channel, as in {"set": {"daq.0": 1.25}}')
         wanted = {
             str(channel): None if value is None else _finite(channel, value) for channel, value in order["set"].items()
         }
@@ -137,7 +142,10 @@ class WorldControl:
 
 
 def _finite(name: str, value: Any) -> float:
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {value!r} is not a number") from None
     if not np.isfinite(number):
         raise ValueError(f"{name}: {value} is not a finite number")
     return number

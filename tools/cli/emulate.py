@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import time
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,6 +23,11 @@ if TYPE_CHECKING:
     from tools.emulate.world import Served
 
 LOOK_S = 0.2
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    """End the command in order, with the world and its sockets, when a CI job sends SIGTERM."""
+    raise SystemExit(128 + number)
 
 
 def emulate(
@@ -73,6 +80,7 @@ def emulate(
         if tcp is not None and "serial" not in buses:
             raise InputError(f"--tcp belongs to serial buses, and {file.path} has none; leave it out")
         columns = [read_stimulus(text) for text in stimulus or ()]
+        signal.signal(signal.SIGTERM, _end)
         with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
             write_json(served.as_dict(), json_file)
             for note in served.notes:

@@ -81,12 +81,12 @@ class Emulated:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    def close(self) -> int:
-        """End it by Ctrl-C; the exit status."""
+    def close(self, number: int = signal.SIGINT) -> int:
+        """End it by a signal, Ctrl-C for one; the exit status."""
         self.answers.close()
         self.control.close()
         if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGINT)
+            os.kill(self.process.pid, number) if number == signal.SIGTERM else os.killpg(self.process.pid, number)
         return self.process.wait(30)
 
 
@@ -231,6 +231,24 @@ def test_ctrl_c_ends_it_and_nothing_is_left(tmp_path: Path) -> None:
     assert not sockets.exists()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_sigterm_as_a_job_of_a_ci_sends_it_leaves_nothing_either(tmp_path: Path) -> None:
+    made = Emulated(tmp_path)
+    pid, sockets = made.described["pid"], Path(made.described["control"]).parent
+    assert made.close(signal.SIGTERM) == 128 + signal.SIGTERM
+    assert not sockets.exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_a_wrong_key_of_the_emulation_names_the_bench(tmp_path: Path) -> None:
+    text = (HERE / "one_chip.toml").read_text().replace('scenario = "rest"', 'scenario = "flying"')
+    (tmp_path / "chip.toml").write_text(text, encoding="utf-8")
+    command = [*MICRON, "emulate", "chip.toml", "--", "true"]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("micron: bench 'one chip': [emulation]: [endoscope.scenario] Input should be 'rest'")
 
 
 def test_a_command_has_the_buses_and_its_exit_status_is_ours(tmp_path: Path) -> None:

@@ -99,7 +99,8 @@ def test_outputs_are_read_and_not_set() -> None:
     [
         ({"set": {"daq.8": 1.0}}, "daq.0"),
         ({"set": {"daq.0": float("nan")}}, "finite"),
-        ({"set": 3}, "items"),
+        ({"set": {"daq.0": "high"}}, "daq.0: 'high' is not a number"),
+        ({"set": 3}, "set takes an object"),
         ({"get": "nobody"}, "no channel"),
         ({"play": "daq.0", "t_s": [0, 0], "values": [1, 2]}, "rise"),
         ({"play": "daq.0", "t_s": [0]}, "values"),
