@@ -74,23 +74,26 @@ def scan(
     with clear_errors():
         check_writable(json_file)
         path = bench_path(bench)
-        load_bench(path)
-        console().print(f"I2C probe '{probe}': {PROBES[probe]}")
+        kinds = {bus.kind for bus in load_bench(path).description.bus.values()}
+        if "i2c" in kinds:
+            console().print(f"I2C probe '{probe}': {PROBES[probe]}")
         if probe is ProbeChoice.WRITE:
             _ask("Write to every address of every I2C bus of this bench?", yes)
         with opened_bench(path, pace=pace_of(virtual)) as opened:
             result = scan_bench(opened, probe.value, seconds, lambda text: console().print(text, style="dim"))
         out = data_console()
         out.print("ports of this machine: " + (", ".join(result.ports) or "none"))
-        table = table_of("I2C", "bus", "address", "declared", "answers", left=4)
-        for a in result.i2c:
-            answered = Text("yes") if a.answered else Text("no", "bold red")
-            table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", answered)
-        out.print(table)
-        traffic = table_of(f"CAN, {seconds:g} s", "bus", "id", "message", "frames", "rate (Hz)", left=5)
-        for c in result.can:
-            traffic.add_row(c.bus, f"0x{c.can_id:03X}", c.name, str(c.frames), f"{c.rate_hz:.1f}")
-        out.print(traffic)
+        if "i2c" in kinds:
+            table = table_of("I2C", "bus", "address", "declared", "answers", left=4)
+            for a in result.i2c:
+                answered = Text("yes") if a.answered else Text("no", "bold red")
+                table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", answered)
+            out.print(table)
+        if "can" in kinds:
+            traffic = table_of(f"CAN, {seconds:g} s", "bus", "id", "message", "frames", "rate (Hz)", left=5)
+            for c in result.can:
+                traffic.add_row(c.bus, f"0x{c.can_id:03X}", c.name, str(c.frames), f"{c.rate_hz:.1f}")
+            out.print(traffic)
         write_json({"format": 1, **result.as_dict()}, json_file)
         if result.missing:
             console().print(f"no answer from {', '.join(result.missing)}: check power, wiring and address")

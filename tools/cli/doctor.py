@@ -20,6 +20,9 @@ from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.terminal import table_of
 
+WIDE = 100
+"""Number of columns of a terminal below which the remedies get most of the width: a command to copy stays whole."""
+
 
 def doctor(
     bench: BenchOption = None,
@@ -50,7 +53,11 @@ def doctor(
         findings = machine_findings() + setting_findings(tree, ports) + bench_findings(file)
         missing = [f for f in findings if f.verdict == "missing"]
         if json_file != "-":
-            table = table_of("micron doctor", "part", "verdict", "found", "what to do", left=4)
+            table = table_of(
+                "micron doctor", "part", "verdict", "found", "what to do", left=4, box=None, pad_edge=False
+            )
+            if data_console().width < WIDE:
+                table.columns[0].max_width, table.columns[2].max_width = 16, 20
             colours = {"ok": "green", "limited": "yellow", "missing": "red"}
             for finding in findings:
                 colour = colours[finding.verdict]

@@ -38,6 +38,13 @@ def test_scan_finds_the_declared_devices_and_the_button(tmp_path: Path):
     assert found["missing"] == []
 
 
+def test_scan_has_no_table_for_a_kind_of_bus_that_the_bench_lacks():
+    done = run("scan", "--virtual", "--seconds", "0", "--bench", "imus")
+    assert done.exit_code == 0
+    assert "I2C" in done.output
+    assert "CAN" not in done.output
+
+
 def test_scan_asks_before_it_writes():
     refused = CliRunner().invoke(app, ["scan", "--virtual", "--probe", "write"], input="n\n")
     assert refused.exit_code == 2

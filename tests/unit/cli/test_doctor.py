@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -38,6 +39,15 @@ def test_calibration_that_is_not_there_is_missing_before_a_run_says_so(place: Pa
     assert done.exit_code == 4
     assert done.stdout.count('"missing"') == 4  # three files, and how many
     assert "copy it beside the bench file" in done.stdout
+
+
+def test_no_word_of_a_remedy_is_broken_on_a_terminal_of_80_columns(place: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    shutil.copy("benches/micron.toml", "alone.toml")
+    done = CliRunner().invoke(app, ["doctor", "--bench", "alone.toml", "--json", "found.json"])
+    assert all(len(line.rstrip()) <= 80 for line in done.output.splitlines())
+    words = {w for f in json.loads(Path("found.json").read_text())["findings"] for w in f["remedy"].split()}
+    assert words <= set(done.output.split())
 
 
 def test_a_bench_that_ships_is_known_by_its_name_and_another_name_is_refused() -> None:
