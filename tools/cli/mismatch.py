@@ -223,7 +223,7 @@ def new(
         check_writable(json_file, reads=[data])
         for option, hertz in (("--rate", rate), ("--resample", resample)):
             if hertz is not None and not 0.0 < hertz < 1e9:
-                raise InputError(f"{option} {hertz:g}: must be a number of samples per second")
+                raise InputError(f"{option} {hertz:g}: must be samples per second, above 0 and below 1e9")
         from tools.mismatch.new import new_recording
 
         made = new_recording(data, out, twin, rate_hz=rate, resample_hz=resample, cut=cut, force=force)
@@ -356,7 +356,7 @@ def apply(
             raise InputError(f"{report}: {error}") from error
         if original is not None and twin.kind != "piezo_stack":
             raise InputError(
-                f"{bench}: a bench runs twins of kind piezo_stack, and this one is a {twin.kind}; leave --bench out"
+                f"{bench}: a bench runs twins of kind piezo_stack, not of kind {twin.kind}; leave --bench out"
             )
         write_twin(twin, body, out)
         for note in twin.notes:

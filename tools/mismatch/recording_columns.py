@@ -84,8 +84,12 @@ class _Format:
 
 
 def _format(path: Path) -> _Format:
+    if path.is_dir():
+        raise RecordingError(f"{path}: this is a folder; name the data file in it")
     if not path.is_file():
-        raise RecordingError(f"{path}: data file does not exist; give its name, in a descriptor relative to its folder")
+        raise RecordingError(
+            f"{path}: data file does not exist; check its name (a recording.toml names it relative to its own folder)"
+        )
     if path.stat().st_size > MAX_BYTES:
         raise RecordingError(f"{path}: larger than {MAX_BYTES >> 30} GiB; cut the recording into parts")
     suffix = path.suffix.lower()

@@ -51,7 +51,8 @@ def from_table(
     """
     where = str(path)
     if text.get("format") != 1:
-        raise RecordingError(f"{where}: format must be 1, got {text.get('format')!r}")
+        got = f"got {text['format']!r}" if "format" in text else "and the file has none"
+        raise RecordingError(f"{where}: format must be 1, {got}; docs/own-data.md has every key")
     if "channels" not in text:
         raise RecordingError(f"{where}: no [[channels]]; describe each column that is used")
     data_name = text.get("data")

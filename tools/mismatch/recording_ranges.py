@@ -103,7 +103,7 @@ def read_split(path: Path, value: object, n: int) -> Split:
             found[key] = path_inside(path, v)
         elif isinstance(v, list) and len(v) == 2 and all(isinstance(i, int) and not isinstance(i, bool) for i in v):
             if not 0 <= v[0] < v[1] <= n:
-                raise RecordingError(f"{at}: [{v[0]}, {v[1]}] does not lie in the {n} samples of the recording")
+                raise RecordingError(f"{at}: [{v[0]}, {v[1]}] must rise and lie in the {n} samples of the recording")
             found[key] = (v[0], v[1])
         else:
             raise RecordingError(f"{at} must be [start, stop] in samples or the name of another .toml, got {v!r}")

@@ -155,7 +155,8 @@ BAD: list[tuple[str, Callable[[Path], None], str]] = [
         and None, "never changes from"),
     ("input is output", _same_numbers, "hold the same numbers"),
     ("pickled", _pickled, "object of shape|pickled"),
-    ("split outside", lambda f: write(f, GOOD + "[split]\nfit = [0, 999]\n") and None, r"\[0, 999\] does not lie"),
+    ("split outside", lambda f: write(f, GOOD + "[split]\nfit = [0, 999]\n") and None, r"\[0, 999\] must rise"),
+    ("split falls", lambda f: write(f, GOOD + "[split]\ntest = [60, 50]\n") and None, r"\[60, 50\] must rise"),
     ("split word", lambda f: write(f, GOOD + '[split]\nfit = "half"\n') and None, "must be .start, stop. in samples"),
 ]  # fmt: skip
 

@@ -75,7 +75,7 @@ def numbers(n: int, z: str = "{k}", command: str = "{k}") -> str:
 SPLIT = GOOD + "\n[split]\n"
 _DECIMAL_COMMA = numbers(90, "{k}.5").replace(",", ";").replace("\n4;4.5", "\n4,5;4.5")
 BAD: dict[str, tuple[str, str | bytes | None, str]] = {
-    "empty descriptor": ("", None, r"recording\.toml: format must be 1"),
+    "empty descriptor": ("", None, r"format must be 1, and the file has none"),
     "empty data": (GOOD, b"", r"data\.csv: no column 'command_mV'; the file has: none"),
     "header alone": (GOOD, "command_mV,z,temp\n", r"data\.csv: no line of numbers below the header"),
     "empty lines alone": (GOOD, "command_mV,z,temp\n\n  \n", r"data\.csv: no line of numbers below the header"),
@@ -91,7 +91,7 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "channels as a table": (GOOD.split("[[channels]]")[0] + "[channels]\na = 1\n", None, r"must be a list"),
     "no data key": (GOOD.replace('data = "data.csv"', ""), None, "'data' must name the data file"),
     "data is a number": (GOOD.replace('"data.csv"', "3"), None, "'data' must name the data file"),
-    "data is a folder": (GOOD.replace('"data.csv"', '"."'), None, "data file does not exist"),
+    "data is a folder": (GOOD.replace('"data.csv"', '"."'), None, "this is a folder; name the data file in it"),
     "parameter as text": (GOOD.replace("0.125", '"big"'), None, "gain_um_per_V must be a finite number, got 'big'"),
     "parameter nan": (GOOD.replace("0.125", "nan"), None, "gain_um_per_V must be a finite number, got nan"),
     "too many values": (GOOD.replace("0.125", "[1, 2]"), None, "gain_um_per_V has 2 entries"),
@@ -115,13 +115,13 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
         None,
         r"\[split\] key 'tets' is unknown; write 'test', or leave it out\. Known keys: fit, test, init",
     ),
-    "further test outside": (SPLIT + "test_more = [300, 4000]", None, r"\[split\] test_more: \[300, 4000\] does"),
+    "further test outside": (SPLIT + "test_more = [300, 4000]", None, r"\[split\] test_more: \[300, 4000\] must rise"),
     "misspelt key of an effect": (
         effect('name = "creep"\ntraget = "displacement"'),
         None,
         r"\[\[twin.effects\]\] 1: key 'traget' is unknown; write 'target'",
     ),
-    "empty range": (SPLIT + "fit = [10, 10]", None, r"\[split\] fit: \[10, 10\] does not lie"),
+    "empty range": (SPLIT + "fit = [10, 10]", None, r"\[split\] fit: \[10, 10\] must rise"),
     "range reversed": (SPLIT + "fit = [300, 10]", None, r"\[split\] fit: \[300, 10\]"),
     "ranges in seconds": (SPLIT + "fit = [0.0, 0.5]", None, r"\[split\] fit must be"),
     "ranges overlap": (SPLIT + "fit = [0, 300]\ntest = [200, 400]", None, r"test \[200, 400\] share"),
