@@ -124,12 +124,12 @@ The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stan
 Matrices of a `state_space` are read in SI (degC stays degC). Its poles, the numerators from each input to each output
 and `y0` are re-fitted, because the data do not tell one choice of states from another. Equations of an `ode` are read
 in the units of the columns unless `units` says otherwise: after `units = { current = "A", bearing = "N m s" }` the fan
-above may record its current in mA, and the report has a unit for `bearing`. Where only the other reading moves as much
-as the recording does, it is taken, with a note. The
-equation of an encoder's output holds its counts: `outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`,
-if given, includes the rounding (0.29 counts). A `mechanical_axis` with the input `torque` turns; with `force` it
-slides. Of simulated `columns` only scale and offset are re-fitted: a wrong time constant of the simulation appears as
-an effect.
+above may record its current in mA, and the report has a unit for `bearing`. If only the other reading fits, it is
+taken, with a note. The equation of an encoder's output holds its counts:
+`outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`, if given, includes the rounding (0.29 counts). A
+`mechanical_axis` with the input `torque` turns; with `force` it slides. `new --twin columns` takes `sim_x_mm` or
+`x_mm_simulated` for the simulated `x_mm`. Only scale and offset of such columns are re-fitted: a wrong time constant
+appears as an effect.
 
 `micron mismatch simulate .` runs the twin that the recording describes and prints what was read (samples, rate, units,
 holds, notes) and the residual, also as a share of the output. A wrong unit or sign shows here, before the diagnosis.
