@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tools.mismatch.engine.checks import clipped_samples, lag_samples, messages
+from tools.mismatch.engine.checks import clipped_samples, lag_samples, messages, repeated_samples
 
 T = np.arange(4000) * 1e-3
 X = np.sin(2 * np.pi * 1.3 * T) + 0.4 * np.sin(2 * np.pi * 3.1 * T)
@@ -52,3 +52,13 @@ def test_swapped_axes() -> None:
     inputs = {"fx": X, "fy": Y}
     found = messages(inputs, {"vx": Y, "vy": X}, {}, {"vx": X, "vy": Y}, {"vx": "fx", "vy": "fy"}, 1e-3)
     assert any("swapped" in m for m in found)
+
+
+def test_equal_neighbours_of_a_rounded_channel_are_no_lost_samples() -> None:
+    rng = np.random.default_rng(3)
+    y = np.round(30.0 * np.sin(np.arange(4000) / 800.0) + 0.05 * rng.standard_normal(4000), 2)
+    assert np.sum(np.diff(y) == 0) > 100
+    assert repeated_samples(y) == 0
+    held = y + 1e-7 * rng.standard_normal(4000)
+    held[1000:1040] = held[1000]
+    assert repeated_samples(held) == 39

@@ -44,11 +44,16 @@ def clipped_samples(y: Array) -> tuple[int, int]:
 
 
 def repeated_samples(y: Array) -> int:
-    """Count the samples that equal the previous one although the channel has fine steps: a logger held its value."""
-    same = int(np.sum(np.diff(y) == 0))
-    if lattice_step(y) > 0 or np.unique(y).size < 0.5 * y.size:
+    """Count the samples that equal the previous one although the channel has fine steps: a logger held its value.
+
+    Rounding makes at most as many equal neighbours as neighbours one step apart; these are taken off.
+    """
+    moves = np.abs(np.diff(y))
+    if lattice_step(y) > 0 or np.unique(y).size < 0.5 * y.size or not np.any(moves):
         return 0
-    return same
+    step = float(moves[moves > 0].min())
+    others = int(np.sum((moves > 0) & (moves < 1.5 * step))) - 1  # beside the move that defines the step
+    return max(int(np.sum(moves == 0)) - others, 0)
 
 
 def lag_samples(y: Array, x: Array, most: int) -> int:
