@@ -12,13 +12,14 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
-from tools.mismatch.engine.found import human_values, values_of_forms
+from tools.mismatch.engine.found import human_values, physics_found, values_of_forms
 from tools.mismatch.engine.intervals import few_blocks, uncertainty
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.engine.trial import extended
 from tools.mismatch.infer import diagnose
+from tools.numbers import rms
 
 Array = np.ndarray
 
@@ -98,6 +99,21 @@ def test_the_instant_of_a_step_has_an_interval() -> None:
     low, high = human_values(problem, fitted, uncertainty(problem, fitted))[placed.label]["time1_s"].ci95
     # two samples and eleven times (0.05 / 0.1)^2, 10 ms each, either way
     assert 0.5 * (high - low) == pytest.approx(0.0475 + 0.0025, abs=0.02)
+
+
+def test_what_is_left_without_an_effect_is_at_most_what_the_base_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    e = np.random.default_rng(8).standard_normal(3000)
+    problem, _, base = prepared(
+        stack(0.1 * (np.arange(3000) >= 1700) + 0.05 * rng.standard_normal(3000)), 0.3, 0, False
+    )
+    place = places(problem, (EFFECTS["step_shift"],), ())[0]
+    model, theta = extended(problem, base, replace(place, settings={"times_s": (17.0,), "time": (0.01, 30.0)}))
+    theta[-2:] = 0.005, 0.1
+    fitted = replace(base, model=model, theta=theta)
+    poor = replace(base, cost=10.0 * base.cost, residual={"displacement": 3.0 * base.residual["displacement"]})
+    monkeypatch.setattr("tools.mismatch.engine.found.reduced", lambda *_: poor)
+    one = physics_found(problem, base, fitted, {}, {"step_shift": 0.9})[0]
+    assert one.residual_rms_before == pytest.approx(rms(base.residual["displacement"][problem.held_rows]))
 
 
 def test_a_fit_part_has_some_of_what_is_seldom() -> None:

@@ -83,7 +83,7 @@ def assemble(
     unsure = uncertainty(problem, fitted)
     shifts = base_shifts(raw, base, fitted, unsure.deviations())
     values = values_of_forms(problem, fitted, unsure, ended.forms)
-    physics = physics_found(problem, fitted, values, sure)
+    physics = physics_found(problem, base, fitted, values, sure)
     exported = without_events(problem, fitted)
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]

@@ -107,13 +107,15 @@ def parameters_of(
 
 
 def physics_found(
-    problem: Problem, fitted: Fit, values: Mapping[str, Mapping[str, ParameterValue]], sure: Mapping[str, float]
-) -> list[PhysicsFound]:
-    """Return the effects of a model; ``values``: its parameters; ``sure``: the probability of every name."""
+    problem: Problem, base: Fit, fitted: Fit, values: Mapping[str, Mapping[str, ParameterValue]],
+    sure: Mapping[str, float],
+) -> list[PhysicsFound]:  # fmt: skip
+    """Return the effects of a model; ``base``: the fit without any; ``values``: its parameters; ``sure``: the
+    probability of every name."""
     rows = problem.held_rows
     out: list[PhysicsFound] = []
     for k, placed in enumerate(fitted.model.placed):
-        small = reduced(problem, fitted, k)
+        small = min(reduced(problem, fitted, k), base, key=lambda f: f.cost)  # a poor minimum would flatter the effect
         c = compare(problem, small, fitted)
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         if placed.site == "feedback":
