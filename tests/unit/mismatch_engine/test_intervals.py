@@ -103,9 +103,7 @@ def test_the_instant_of_a_step_has_an_interval() -> None:
 
 def test_what_is_left_without_an_effect_is_at_most_what_the_base_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
     e = np.random.default_rng(8).standard_normal(3000)
-    problem, _, base = prepared(
-        stack(0.1 * (np.arange(3000) >= 1700) + 0.05 * rng.standard_normal(3000)), 0.3, 0, False
-    )
+    problem, _, base = prepared(stack(0.1 * (np.arange(3000) >= 1700) + 0.05 * e), 0.3, 0, False)
     place = places(problem, (EFFECTS["step_shift"],), ())[0]
     model, theta = extended(problem, base, replace(place, settings={"times_s": (17.0,), "time": (0.01, 30.0)}))
     theta[-2:] = 0.005, 0.1
