@@ -54,6 +54,13 @@ def test_explained_share_is_of_what_stands_above_the_noise():
     assert " ".join(row.split()) == "displacement (um) 0.55 0.41 0.023 0.02 (spectrum) 100 %"
 
 
+def test_names_that_are_not_likely_are_not_said_to_be_missing():
+    report = missing_physics()
+    doubtful = replace(report, physics=tuple(replace(p, confidence=0.3) for p in report.physics))
+    assert "What may be missing: no name is likelier than not" in printed(doubtful)
+    assert "What may be missing" not in printed(report)
+
+
 def test_agrees_lists_every_detection_limit():
     text = printed(all_verdicts()["agrees"])
     assert "resonance 0.02, creep 0.03, backlash 0.05, dead time 0.4" in text

@@ -261,7 +261,8 @@ def leaves_nothing(report: Report) -> bool:
 def physics_title(report: Report) -> str:
     """Return the heading of the named effects."""
     if report.verdict == "missing_physics":
-        return "What is missing"
+        likely = any(p.confidence > 0.5 for p in report.physics)
+        return "What is missing" if likely else "What may be missing: no name is likelier than not"
     return "What would explain it" if leaves_nothing(report) else "What explains a part of it"
 
 
