@@ -31,8 +31,8 @@ MEANINGS: Mapping[str, str] = {
     " and the start of the record",
     "place_not_reachable": "this kind of twin can be changed at its inputs and outputs only, and what is left may sit"
     " between them. A twin with its equations (ode, mechanical_axis, state_space with one input) can be tried inside",
-    "unknown": "the noise floor is known well enough, the fit holds and every place of this twin was tried: no effect"
-    " of the vocabulary does this",
+    "unknown": "the noise floor is known well enough, the fit holds and every place that this kind of twin has was"
+    " tried: no effect of the vocabulary does this",
 }
 """Meanings of the verdict ``unexplained``, with the advice for each."""
 IMITATED = (
@@ -41,9 +41,9 @@ IMITATED = (
 )
 """Meaning of ``place_not_reachable`` where the named effects leave nothing."""
 FOLLOWS_NOTHING = (
-    "the fit holds and every place of this twin was tried, but what is left follows no recorded signal. It may be slow"
-    " noise, a disturbance that is not recorded, or several effects at once: a thousand samples with the input"
-    " at rest show what is there without the input"
+    "the fit holds and every place that this kind of twin has was tried, but what is left follows no recorded signal."
+    " It may be slow noise, a disturbance that is not recorded, or several effects at once: a thousand samples with the"
+    " input at rest show what is there without the input"
 )
 """Meaning of ``unknown`` where the residual depends on nothing that was recorded."""
 UNSURE = 0.75
