@@ -21,6 +21,7 @@ from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
 from sim_devices.physics.flows import OVERFLOW, SQUARE_ROOT_OUTFLOW
 from sim_devices.physics.friction import BOUC_WEN, COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
+from sim_devices.physics.heat_loss import NONLINEAR_HEAT_LOSS
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
@@ -81,6 +82,7 @@ _ALL = (
     GRAVITY_LOAD,
     SQUARE_ROOT_OUTFLOW,
     OVERFLOW,
+    NONLINEAR_HEAT_LOSS,
     PARAMETER_VARIATION,
     DIRECTION_DEPENDENCE,
     ONE_SIDED_CONDUCTION,

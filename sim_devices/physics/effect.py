@@ -253,8 +253,10 @@ class Effect:
     direction of a state."""
     end_units: tuple[str, ...] = ()
     """Units that the signal at an input or output must have for the effect to sit there; empty: any."""
-    position_unit: str = ""
-    """Unit that the position must have for a feedback effect; empty: any."""
+    position_units: tuple[str, ...] = ()
+    """Units of which the position must have one for a feedback effect; empty: any."""
+    not_units: tuple[str, ...] = ()
+    """Units that the position cannot have: no temperature flows over."""
     twins: tuple[str, ...] = ()
     """Twin kinds that can have the effect; empty: all."""
     available: Callable[[Mapping[str, Array], str], str] | None = None

@@ -14,6 +14,8 @@ PAIRS = "pairs"
 outflow of each storage comes first, then the flows from it into others."""
 
 
+NO_LEVELS = ("degC", "K", "A")
+"""Units of states that have no rim and no opening: temperatures and currents."""
 RANGES = "ranges"
 """Name of a fact of a place: lowest level, highest level, rms rate and highest possible rim of each storage, flattened
 in the order of ``storages_of``. A recorded level shows its rim; a simulated one moves with the fit."""
@@ -132,6 +134,7 @@ SQUARE_ROOT_OUTFLOW = Effect(
     fill=lambda q, w, s: _fill(ROOT, q, w, s),
     report=lambda p, s, g: _report("empty_level", "{out}^0.5/s", p, s),
     acts_on=("storage", "storages"),
+    not_units=NO_LEVELS,
 )
 
 
@@ -172,4 +175,5 @@ OVERFLOW = Effect(
     fill=lambda q, w, s: _fill(ABOVE, q, w, s),
     report=lambda p, s, g: _report("level", "1/s", p, s),
     acts_on=("storage", "storages"),
+    not_units=NO_LEVELS,
 )

@@ -21,7 +21,8 @@ SPRING = 10
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
 COGGING = 7  # period, sin1, cos1, sin2, cos2; sine and cosine of the angle itself (gravity)
 FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
-ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
+ROOT, ABOVE, CONVECTION, RADIATION_K, RADIATION_C = range(5)  # laws of a flow
+ZERO_C = -273.15
 
 
 def packed(family: str, size: int, at: Mapping[int, float]) -> dict[str, Array]:
@@ -133,15 +134,17 @@ def smooth_force(p, v, spring, cogging, friction, place):
 
 @kernel
 def flow_of(x, law, strength, level):
-    """Return the flow for a state x by ``law``: the root of x, x above a level, the square of x, or x itself."""
+    """Return the flow for a state x by ``law`` of what x is above a level: its root, itself, its power 1.25, or the
+    difference of their fourth powers as absolute temperatures (in K or degC)."""
     over = x - level
-    if law == 0.0:
-        return strength * np.sqrt(over) if over > 0.0 else 0.0
-    if law == 1.0:
-        return strength * over if over > 0.0 else 0.0
     if law == 2.0:
-        return strength * over * abs(over)
-    return strength * over
+        return strength * over * abs(over) ** 0.25
+    if law >= 3.0:
+        zero = 0.0 if law == 3.0 else ZERO_C
+        return strength * (max(x - zero, 0.0) ** 4 - max(level - zero, 0.0) ** 4)
+    if over <= 0.0:
+        return 0.0
+    return strength * (np.sqrt(over) if law == 0.0 else over)
 
 
 def base_moves(x: Array, ctx: Context) -> list[Array]:

@@ -215,7 +215,7 @@ GRAVITY_LOAD = Effect(
     basis=lambda x, ctx, q, settings: np.stack([np.sin(x), np.cos(x)], axis=1),
     fill=lambda q, w, settings: packed("cogging", COGGING, {5: w[0], 6: w[1]}),
     report=_lever_report,
-    position_unit="rad",
+    position_units=("rad",),
     limits={"turns_seen": (LEAST_TURNED, np.inf)},
     vanishes_with=(("largest_load",),),
 )

@@ -45,6 +45,7 @@ NAMES = (
     "gravity_load",
     "square_root_outflow",
     "overflow",
+    "nonlinear_heat_loss",
     "parameter_variation",
     "direction_dependence",
     "one_sided_conduction",

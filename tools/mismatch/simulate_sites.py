@@ -56,7 +56,7 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
     if effect.kind == "feedback" and not twin.feedback_on:
         return "the twin has no equation of motion"
     if effect.kind == "feedback" and not _acts_at(twin, effect):
-        return f"no {effect.position_unit or 'state'} that it could act on"
+        return f"no {' or '.join(effect.position_units) or 'state'} that it could act on"
     if effect.sites == ("between",) and not between_of(twin):
         return "no place between two filters"
     if effect.end_units and not between_of(twin) and not any(map(_unit_fits_at(twin, effect), twin.units)):
@@ -82,9 +82,11 @@ def places_of(twin: Twin) -> tuple[Place, ...]:
 
 def _acts_at(twin: Twin, effect: Effect) -> list[Place]:
     """Return the places of a twin at which a force or flow may act: those of its kind and of the unit it requires."""
-    return [
-        p for p in places_of(twin) if p.kind in effect.acts_on and effect.position_unit in ("", _position_unit(twin, p))
-    ]
+
+    def fits(unit: str) -> bool:
+        return unit not in effect.not_units and (not effect.position_units or unit in effect.position_units)
+
+    return [p for p in places_of(twin) if p.kind in effect.acts_on and fits(_position_unit(twin, p))]
 
 
 def _position_unit(twin: Twin, place: Place) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from sim_devices.physics.effect import Array, Context, Settings
 from sim_devices.physics.flows import PAIRS, RANGES
 from sim_devices.physics.forces import base_moves
+from sim_devices.physics.heat_loss import KELVIN, TEMPERATURES
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
@@ -270,6 +271,8 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
         position, velocity = inside.course(run, base, pl.target)
         through = inside.through(run, pl.target, base, output)
         facts = {**ctx.facts, PAIRS: inside.place(pl.target).pairs}
+        if inside.place(pl.target).unit in TEMPERATURES:
+            facts[KELVIN] = (float(inside.place(pl.target).unit == "K"),)
         if inside.place(pl.target).kind in ("storage", "storages"):
             facts[RANGES] = inside.storage_ranges(run, base, pl.target, view.mask)
         return position, replace(ctx, signals={**signals, "velocity": velocity}, through=through, facts=facts)

@@ -127,6 +127,13 @@ def tanks() -> Recording:
     return equations({**table, "inflow": 1.5, "drain": 0.8, "hold": "zero"}, ("pump",), ("level", "both"), "V")
 
 
+def heater(unit: str) -> Recording:
+    """A plate that is heated, in degC or K."""
+    table: dict[str, Any] = {"states": {"plate": {"unit": unit, "start": 300.0}}}
+    table["equations"] = {"plate": "volts - loss*(plate - 290)"}
+    return equations({**table, "loss": 0.4}, ("volts",), ("plate",), unit)
+
+
 def two_bodies() -> Recording:
     """Two bodies with a spring between them; an effect may be in that joint."""
     states = {"motor": "rad", "w_1": "rad/s", "load": "rad", "w_2": "rad/s"}
@@ -169,6 +176,8 @@ TWINS: dict[str, Callable[[], Recording]] = {
     "ode motor": motor,
     "ode tanks": tanks,
     "ode two bodies": two_bodies,
+    "ode heater": lambda: heater("degC"),
+    "ode heater in K": lambda: heater("K"),
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array
 from sim_devices.physics.flows import PAIRS, flow_pairs, level_names, storages_of
+from sim_devices.physics.heat_loss import CONVECTED, POWER, zero_of
 from sim_devices.physics.parameter import RATE_SIGN
 from tools.errors import InputError
 from tools.guest.equations import (
@@ -236,6 +237,8 @@ class EquationLines:
             return [f"rates[{one.place.target}] +={force(one.slot).smooth.removeprefix(' +')}"]
         lines: list[str] = []
         settings = one.slot.placed.settings
+        if name == "nonlinear_heat_loss":
+            return [self._heat(one)]
         names = level_names("empty_level" if name == "square_root_outflow" else "level", settings)
         levels = dict(zip(storages_of(settings), names, strict=True))
         for weight, (a, b) in zip(one.slot.placed.parts.weights, flow_pairs(settings), strict=True):
@@ -243,6 +246,15 @@ class EquationLines:
             flow = f"np.sqrt({over})" if name == "square_root_outflow" else over
             lines.append(f"rates[{b}] {'-' if a == b else '+'}= {one.slot.at(weight.name)} * {flow}")
         return lines
+
+    def _heat(self, one: Inner) -> str:
+        """Return the line that takes heat from a state."""
+        settings, loss, at = one.slot.placed.settings, one.slot.at("loss"), f"s[{one.place.target}]"
+        if one.slot.placed.effect.equation == CONVECTED.equation:
+            over = f"({at} - {one.slot.at('surroundings')})"
+            return f"rates[{one.place.target}] -= {loss} * {over} * abs({over}) ** {POWER - 1.0}"
+        zero, (low, _) = zero_of(settings), settings["range"]
+        return f"rates[{one.place.target}] -= {loss} * (max({at} - {zero}, 0.0) ** 4 - {max(low - zero, 0.0) ** 4})"
 
     def _forces(self, moved: Sequence[Inner]) -> tuple[list[str], list[str]]:
         """Return the lines inside ``derivatives`` (``s``: states, ``h``: step), and those that define the steps."""

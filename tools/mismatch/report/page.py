@@ -92,7 +92,7 @@ def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
     known = EFFECTS.get(p.name)
     return {
         "found": p,
-        "inside": wording.place_inside(p),
+        "inside": wording.place_before_output(p),
         "title": words(p.name),
         "summary": known.summary if known else "",
         "equation": svg.equation(p.equation),

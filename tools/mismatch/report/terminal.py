@@ -60,7 +60,7 @@ def _physics(k: int, p: PhysicsFound, report: Report) -> RenderableType:
         value, lo, hi = wording.interval(v)
         t.add_row(Text(wording.label(name, v.unit)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
     rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, report.fit)), ("source", p.source)]
-    if inside := wording.place_inside(p):
+    if inside := wording.place_before_output(p):
         rows.append(("place", inside))
     if p.note:
         rows.append(("place", f"{p.note}: this recording cannot tell"))

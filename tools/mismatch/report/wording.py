@@ -105,8 +105,10 @@ def label(name: str, unit: str) -> str:
     return words(short)
 
 
-def place_inside(p: PhysicsFound) -> str:
-    """Return the place of a force, a flow or a changing parameter inside the twin; "" at inputs and outputs."""
+def place_before_output(p: PhysicsFound) -> str:
+    """Return the input that an effect changes, or its place inside the twin; "" at outputs."""
+    if p.site == "input":
+        return f"the input {p.target}"
     return p.target if p.site == "feedback" and p.target not in p.outputs else ""
 
 
