@@ -20,7 +20,8 @@ from drivers.adc.ads1115 import EXCHANGE_NS, ORDER_NS, RATE_TOLERANCE, WAKE_UP_N
 from drivers.options import AmplifierMonitorOptions
 from drivers.output_guard import OutputGuard
 from drivers.registry import Driver
-from hal.contracts import Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import Clock
 
 GROSS = 8.0
 """Deviation, as a multiple of the tolerance, that one reading proves: neither noise nor a model error is as large."""
@@ -94,7 +95,7 @@ class AmplifierMonitor:
         name: str = "monitor",
     ) -> None:
         self.name = name
-        self.volts: Float64Array = np.full(len(channels), np.nan)
+        self.volts: Array = np.full(len(channels), np.nan)
         """Last reading of each output, V."""
         self.readings = 0
         self.suspicions = 0

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from drivers.output_guard import GuardedOutput, OutputGuard
+from hal.arrays import Array
 from hal.backends import nidaqmx_package
-from hal.contracts import Clock, Float64Array
+from hal.contracts import Clock
 from hal.errors import BenchError
 from hal.types import OutputLimit
 
@@ -89,7 +90,7 @@ class NidaqmxOutput(GuardedOutput):
         )
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         mask = self.guard.admit(values_V)
         self._send()
         return mask
@@ -102,7 +103,7 @@ class NidaqmxOutput(GuardedOutput):
         self._send()
         return done
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         data = np.zeros(len(self.limits))
         try:
             self._reader.read_one_sample(data, READ_TIMEOUT_S)

@@ -27,7 +27,8 @@ from drivers.output_guard_steps import (
     next_ramp_step,
     note_sent,
 )
-from hal.contracts import ARMING_STEP_S, Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import ARMING_STEP_S, Clock
 from hal.errors import ErrorKind, HalError, SafetyTrip
 from hal.types import OutputLimit
 
@@ -103,7 +104,7 @@ class OutputGuard:
             p = k % KEPT
             yield SentCommand(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n]))
 
-    def admit(self, values_V: Float64Array) -> int:
+    def admit(self, values_V: Array) -> int:
         """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.
 
         Raises ``SafetyTrip`` when not armed, on a wrong number of values and on a value that is not finite.

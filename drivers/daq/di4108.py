@@ -19,7 +19,8 @@ import numpy as np
 
 from drivers.options import Di4108Options
 from drivers.registry import Driver, Site
-from hal.contracts import Clock, Int16Array, SerialPort
+from hal.arrays import Int16Array
+from hal.contracts import Clock, SerialPort
 from hal.errors import (
     BenchError,
     ErrorKind,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from hal.contracts import Clock, Int16Array, SerialPort
+from hal.arrays import Int16Array
+from hal.contracts import Clock, SerialPort
 from hal.scan_time import ScanTimeline
 from hal.types import ScanBlock, ScanConfig, ScanInfo, Status, TimeSource
 

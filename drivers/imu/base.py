@@ -13,9 +13,8 @@ from enum import Enum
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.contracts import Float64Array
+from hal.arrays import Array, Int32Array
 from hal.errors import BenchError
 from hal.scan_time import ScanTimeline
 from hal.types import STANDARD_GRAVITY, ChannelInfo, Status, TimeSource
@@ -26,7 +25,6 @@ LATE = 0.02  # periods; a read this much short of two periods after the last one
 
 Mode = Literal["data ready", "fifo"]
 Triple = tuple[float, float, float]
-Int32Array = NDArray[np.int32]
 
 
 class PowerMode(Enum):
@@ -62,9 +60,9 @@ class ImuSample:
     ``Status.STALE`` repeats the last one: its ``t_ns`` and ``seq`` too. ``field_T`` is NaN without magnetometer.
     """
 
-    accel_mps2: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
-    gyro_rad_s: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
-    field_T: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
+    accel_mps2: Array = field(default_factory=lambda: np.full(3, np.nan))
+    gyro_rad_s: Array = field(default_factory=lambda: np.full(3, np.nan))
+    field_T: Array = field(default_factory=lambda: np.full(3, np.nan))
     temperature_C: float = math.nan
     raw: Int32Array = field(default_factory=lambda: np.zeros(7, np.int32))
     t_ns: int = 0
@@ -78,8 +76,8 @@ class ImuBlock:
     """Holds the samples of one FIFO read: ``n`` rows, oldest first, taken ``dt_ns`` apart from ``t0_ns`` on."""
 
     def __init__(self, capacity: int = 512) -> None:
-        self.accel_mps2: Float64Array = np.full((capacity, 3), np.nan)
-        self.gyro_rad_s: Float64Array = np.full((capacity, 3), np.nan)
+        self.accel_mps2: Array = np.full((capacity, 3), np.nan)
+        self.gyro_rad_s: Array = np.full((capacity, 3), np.nan)
         self.raw: Int32Array = np.zeros((capacity, 6), np.int32)
         self.temperature_C = math.nan
         self.capacity = capacity

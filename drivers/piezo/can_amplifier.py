@@ -42,7 +42,8 @@ from drivers.piezo.can_node import (
     note_setpoint,
 )
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import CanBus, Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import CanBus, Clock
 from hal.errors import BenchError, HalError, HalTimeout, ProtocolError, SafetyTrip
 from hal.types import CanFrame, ChannelInfo, OutputLimit
 from hal.wire_bits import can_bits
@@ -96,7 +97,7 @@ class CanAmplifier(GuardedOutput):
         return self.node.words[STATE]
 
     @property
-    def measured_V(self) -> Float64Array:
+    def measured_V(self) -> Array:
         """Return the voltages (3,) in V that the node has measured, not a number before its first STATUS."""
         return np.array(self.node.measured_V)
 
@@ -159,7 +160,7 @@ class CanAmplifier(GuardedOutput):
         self.pending = None
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Raises also when the node is not armed or is
         silent."""
         if self.pending is not None:
@@ -190,7 +191,7 @@ class CanAmplifier(GuardedOutput):
             )
         return False
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the voltages (3,) in V that the node measured, from its next status frame. It holds the set point
         meanwhile."""
         if not self.guard.armed:

@@ -15,7 +15,8 @@ from drivers.base import wait_s
 from drivers.options import OutputOptions
 from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import Clock, Float64Array, I2cBus
+from hal.arrays import Array
+from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, HalError, ProtocolError
 from hal.types import ChannelInfo, I2cOp, OutputLimit
 
@@ -157,7 +158,7 @@ class DacOutput(GuardedOutput):
             yield
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         """Write ``values_V`` (3,). With ``read_back``, raises ``ProtocolError`` when the DAC holds another command."""
         if self.pending is not None:
             a, b, c = (self._code(value_V) for value_V in self.guard.next_V)
@@ -189,7 +190,7 @@ class DacOutput(GuardedOutput):
                 return f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {commanded_V:.3f} V"
         return ""
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the input registers as volts (3,). They equal the outputs after each update command."""
         return np.array(self.read_codes(), dtype=np.float64) * self.lsb_V
 

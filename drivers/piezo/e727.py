@@ -20,7 +20,8 @@ from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, LATE, PERIOD_NS, SUPERSEDED, WORDS
 from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import Clock, Float64Array, SerialPort
+from hal.arrays import Array
+from hal.contracts import Clock, SerialPort
 from hal.errors import BenchError, WrongDevice
 from hal.types import ChannelInfo, OutputLimit
 from hal.wire_bits import serial_bits
@@ -130,7 +131,7 @@ class E727(GuardedOutput):
         """Return the number of values that were given up, because the line was slower than asked for."""
         return self.words[LATE]
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Between two command times only the newest values
         count, the others are ``superseded``. Raises errors of the controller some commands later."""
         self.link.take_error()
@@ -164,7 +165,7 @@ class E727(GuardedOutput):
         self.guard.sent()
         return done
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the piezo voltages (3,) in V that the controller measures (``VOL?``)."""
         self.link.settle()
         return np.array(self.link.values("VOL? 1 2 3", CHANNELS))

@@ -38,8 +38,9 @@ from firmware_py.run.safety import State
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.task import TickInfo
 from firmware_py.scheduler.ticker import Ticks, silent_at_ns
+from hal.arrays import Array
 from hal.clock import VirtualClock
-from hal.contracts import AnalogOutput, Clock, Float64Array
+from hal.contracts import AnalogOutput, Clock
 from hal.errors import BenchError
 from hal.types import ScanBlock, TimeSource
 
@@ -430,7 +431,7 @@ class CompiledMicron(Micron):
             self._call_back()
         return k
 
-    def _show(self, frame: Float64Array) -> None:
+    def _show(self, frame: Array) -> None:
         """Let everything in Python that reads the frame read ``frame``: the thread is at work on its own."""
         self.frame = self._watch.frame = frame
 

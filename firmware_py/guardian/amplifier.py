@@ -10,7 +10,8 @@ from drivers.piezo.dac_output import DacOutput
 from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Phase
-from hal.contracts import ARMING_STEP_S, Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import ARMING_STEP_S, Clock
 from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
@@ -71,7 +72,7 @@ class GuardedAmplifier:
     def commands_sent(self) -> int:
         return self.inner.commands_sent
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         """Raises ``LeaseLost`` when the guardian has the outputs, or will have them because the lease is over."""
         return self.inner.write(values_V)
 
@@ -84,7 +85,7 @@ class GuardedAmplifier:
             self._heart.say(Phase.IDLE)
         return done
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         return self.inner.readback_V()
 
     def close(self) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.designs import design
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from hal.compiled import kernel
 
 CORNER_HZ = 2.0

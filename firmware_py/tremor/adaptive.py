@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import EstimatorParams, EstimatorState, Family, Samples
+from hal.arrays import Array
 from hal.compiled import kernel
 
 STARTED, FED, LEARNED = range(3)

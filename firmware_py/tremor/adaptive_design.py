@@ -20,13 +20,10 @@ from math import cos, isfinite, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.tremor.config import AdaptiveConfig, LeverConfig, TremorConfig
-from hal.arrays import Array
-
-Complex = NDArray[np.complex128]
+from hal.arrays import Array, ComplexArray
 
 GRID_STEP_HZ = 0.02
 GRID_STOP_HZ = 250.0
@@ -39,7 +36,7 @@ LEVELS = 2  # calm, burst
 class Bank:
     """Resonators z <- p z + (1 - |p|) y (two states each), low-passes, and the sample itself; of each channel."""
 
-    pole: Complex
+    pole: ComplexArray
     slow: Array
     channels: int = 1
 
@@ -52,7 +49,7 @@ class Bank:
     def size(self) -> int:
         return self.channels * self.one
 
-    def response(self, z: Complex) -> Complex:
+    def response(self, z: ComplexArray) -> ComplexArray:
         """(one, len(z)) from a channel's sample to its features, z = exp(j w / rate)."""
         p, gain = self.pole[:, None], 1.0 - np.abs(self.pole[:, None])
         one, other = gain / (1.0 - p / z), gain / (1.0 - np.conj(p) / z)
@@ -116,7 +113,7 @@ class _Spectra:
     """
 
     hz: Array
-    seen: Complex  # from displacement to sample
+    seen: ComplexArray  # from displacement to sample
     tremor: Array  # (2, f)
     rest: Array
     noise: Array
@@ -193,7 +190,7 @@ def lean_of(config: TremorConfig) -> Lean:
     return Lean(by_up, np.einsum("ikn,nm,ilm->ikl", carried, noise, carried))
 
 
-def sensor_response(config: TremorConfig, hz: Array) -> Complex:
+def sensor_response(config: TremorConfig, hz: Array) -> ComplexArray:
     """Return the response from displacement to sample: the RC filter, and -w^2 for an accelerometer."""
     w = 2.0 * pi * hz
     cutoff = config.filter_cutoff_rad_s
@@ -310,7 +307,7 @@ def _drift(config: TremorConfig, hz: Array) -> Array:
     return np.asarray(low_pass * 4.0 * a.drift_m_s2**2 * a.drift_s / (1.0 + (2.0 * pi * hz * a.drift_s) ** 2))
 
 
-def block_response(hz: Array, block_ticks: int, tick_hz: float) -> Complex:
+def block_response(hz: Array, block_ticks: int, tick_hz: float) -> ComplexArray:
     """Return the frequency response of the mean over a block, timed at its last sample."""
     lag = np.exp(-1j * pi * hz * (block_ticks - 1) / tick_hz)
     return _complex(lag * np.sinc(hz * block_ticks / tick_hz) / np.sinc(hz / tick_hz))
@@ -323,11 +320,11 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     return np.asarray(np.linalg.solve(scaled, (right * scale).T).T * scale)
 
 
-def _complex(x: Any) -> Complex:
+def _complex(x: Any) -> ComplexArray:
     return np.asarray(x, dtype=np.complex128)
 
 
-def _polynomial(coefficients: Array, x: Complex) -> Complex:
+def _polynomial(coefficients: Array, x: ComplexArray) -> ComplexArray:
     """c0 + c1 x + c2 x^2"""
     return coefficients[0] + x * (coefficients[1] + x * coefficients[2])
 
@@ -363,8 +360,8 @@ class _Prior:
 
     config: TremorConfig
     s: _Spectra
-    plain: Complex
-    target: Complex
+    plain: ComplexArray
+    target: ComplexArray
     wanted: list[Array]
     moving: Array
 
@@ -432,7 +429,7 @@ def _core_filter(config: TremorConfig) -> tuple[Array, Array]:
     return b, denominator
 
 
-def _unweighted(prior: _Prior, bank: Bank, through_gate: Complex) -> dict[str, Any]:
+def _unweighted(prior: _Prior, bank: Bank, through_gate: ComplexArray) -> dict[str, Any]:
     """Return the fields of ``AdaptiveDesign`` that no filter of errors weighs, stacked over the axes."""
     config, s, plain, moving, a = prior.config, prior.s, prior.plain, prior.moving, prior.config.adaptive
     z = _complex(np.exp(1j * (2.0 * pi * s.hz) / config.tick_hz))
@@ -465,7 +462,7 @@ def _over_axes(each: Sequence[Array]) -> Array:
     return np.stack([*each] * (AXES // len(each)))
 
 
-def _weighted(prior: _Prior, errors: tuple[Array, Array], back: Complex) -> WeightedDesign:
+def _weighted(prior: _Prior, errors: tuple[Array, Array], back: ComplexArray) -> WeightedDesign:
     """Return the prior as it is seen through the filter ``errors`` (numerator, denominator). ``back`` (n,): response of
     a delay of one tick."""
     config, s, target, a = prior.config, prior.s, prior.target, prior.config.adaptive
@@ -502,7 +499,7 @@ def _weighted(prior: _Prior, errors: tuple[Array, Array], back: Complex) -> Weig
 
 
 def _lean_noise(
-    config: TremorConfig, s: _Spectra, phi: Complex, weight: Complex, target: Complex
+    config: TremorConfig, s: _Spectra, phi: ComplexArray, weight: ComplexArray, target: ComplexArray
 ) -> tuple[Array, Array]:
     """Return (2, OUTPUTS, one) and (2,): what noise of unit density over w^2 and over w^4 adds to a channel's
     ``noise_cross`` and to ``noise_power``."""
@@ -517,12 +514,12 @@ def _lean_noise(
     return np.array(cross), np.array([np.sum(d * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for d in densities])
 
 
-def _covariance(features: Complex, density: Array, channels: Array) -> Array:
+def _covariance(features: ComplexArray, density: Array, channels: Array) -> Array:
     of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
     return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
 
 
-def _cross(features: Complex, density: Complex | Array, channel: Array) -> Array:
+def _cross(features: ComplexArray, density: ComplexArray | Array, channel: Array) -> Array:
     """(m,): features of all channels with a signal that ``channel`` (C,) relates to each of them."""
     of_tip = np.real(np.conj(features) @ density) * GRID_STEP_HZ
     return np.asarray(np.kron(channel, of_tip), dtype=np.float64)

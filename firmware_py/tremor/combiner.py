@@ -11,12 +11,13 @@ from __future__ import annotations
 from cmath import exp
 from math import pi, sqrt
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
 from firmware_py.tremor.seen import Seen, seen_params, undo
 from firmware_py.tremor.wflc import WflcParams, WflcState, wflc_params, wflc_step
+from hal.arrays import Array
 from hal.compiled import kernel
 
 TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the start frequency

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
-from firmware_py.records import Array, Records, copy_record, field, new, record
+from firmware_py.records import Records, copy_record, field, new, record
 from firmware_py.tremor.detector_config import DetectorConfig
 from firmware_py.tremor.prefilter import prefilter_step
+from hal.arrays import Array
 from hal.compiled import kernel
 
 SECTIONS = 3

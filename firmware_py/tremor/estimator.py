@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from firmware_py.records import Array, Records, copy_record, new
+from firmware_py.records import Records, copy_record, new
 from firmware_py.tremor.adaptive import ADAPTIVE
 from firmware_py.tremor.adaptive_design import lever_signals
 from firmware_py.tremor.combiner import (
@@ -27,6 +27,7 @@ from firmware_py.tremor.combiner import (
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, HISTORY, ROWS, TURNS, EstimatorParams, EstimatorState, Family, Samples
 from firmware_py.tremor.own import FOREIGN
+from hal.arrays import Array
 from hal.compiled import inlined_kernel, kernel
 from hal.kernel_calls import ChosenKernel
 

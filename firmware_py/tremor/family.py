@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from firmware_py.records import Array, Records, field, record
+from firmware_py.records import Records, field, record
 from firmware_py.tremor.combiner import CombinerParams, CombinerState
 from firmware_py.tremor.config import TremorConfig
+from hal.arrays import Array
 from hal.compiled import kernel
 
 AXES = 3

@@ -20,9 +20,10 @@ from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.plugins import ESTIMATORS, load
