@@ -51,7 +51,7 @@ class Watch:
         incidents.bad_for(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         if odd := self._check.odd():
             incidents.notice(odd)
-        self._run.look_after_guardian()
+        self._run.check_guardian()
         self._listen_to_the_button()
 
     def _listen_to_the_button(self) -> None:
@@ -70,8 +70,8 @@ class Watch:
         """Run the read-back task (100 Hz, 300 Hz without a monitor): the amplifier must hold the value it was sent. A
         DAC that restarted or received a wrong value does not, nor one that rests beside neutral in a hold."""
         assert self._devices.verify_output is not None
-        care = self._run.guardian
-        rests = self._supervisor.state is State.HOLD and not (care is not None and care.heart.taken_ns)
+        lifecycle = self._run.guardian
+        rests = self._supervisor.state is State.HOLD and not (lifecycle is not None and lifecycle.heartbeat.taken_ns)
         if not (self._supervisor.may_move or rests):
             return
         name = self._devices.amplifier.name
@@ -84,8 +84,8 @@ class Watch:
     def _report_difference(self, what: str) -> None:
         """Report that the outputs differ from the command. After a stall of this process they differ because the
         guardian has moved them; then that is reported instead."""
-        care, name = self._run.guardian, self._devices.amplifier.name
-        if care is not None and care.heart.taken_ns:
+        lifecycle, name = self._run.guardian, self._devices.amplifier.name
+        if lifecycle is not None and lifecycle.heartbeat.taken_ns:
             self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
         else:
             self._incidents.report(Finding.OUTPUT_DIFFERS, device=name, what=what)

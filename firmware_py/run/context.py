@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.guardian.care import GuardianCare
+from firmware_py.guardian.lifecycle import GuardianLifecycle
 from firmware_py.live.link import LiveLink
 from firmware_py.run.findings import Finding
 from firmware_py.run.host_gaps import HostGaps
@@ -43,7 +43,7 @@ class Run:
     recorder: Recorder | None = None
     live: LiveLink | None = None
     on_status: StatusSink | None = None
-    guardian: GuardianCare | None = None
+    guardian: GuardianLifecycle | None = None
     sense_only: bool = False
     others_stalled_ms: Callable[[int, float], float] | None = None
     spares_host: bool = False
@@ -89,10 +89,10 @@ class Run:
         others_ms = self.others_stalled_ms(now_ns, within_ms) if self.others_stalled_ms is not None else 0.0
         return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
 
-    def look_after_guardian(self) -> None:
+    def check_guardian(self) -> None:
         """Report a lost guardian. Heartbeats go both ways: outputs do not move without a guardian that would take them
         to neutral."""
-        if self.guardian is not None and self.supervisor.is_active and (why := self.guardian.look()):
+        if self.guardian is not None and self.supervisor.is_active and (why := self.guardian.check()):
             self.incidents.report(Finding.GUARDIAN_LOST, what=why)
 
     def restore_guardian(self) -> None:

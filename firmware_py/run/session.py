@@ -40,7 +40,7 @@ def run_plan(
     with contextlib.ExitStack() as stack:
         parts = plan.open(opened)
         limits = limits_of(plan.safety, request)
-        output = stack.enter_context(guarded(opened, parts.output, limits, may_end_us=own_process))
+        output = stack.enter_context(guarded(opened, parts.output, limits, may_be_killed=own_process))
         metadata = recording_metadata(plan.bench, parts, opened)
         recorder = None
         if request.record is not None:
@@ -53,7 +53,7 @@ def run_plan(
             recorder=recorder,
             live=_open_link(request, opened, metadata, stack),
             on_status=on_status,
-            guardian=output.care,
+            guardian=output.lifecycle,
             sense_only=request.sense_only,
             others_stalled_ms=opened.world.stalled_ms if opened.world is not None else None,
             spares_host=isinstance(opened.clock, MonotonicClock) and is_emulated(opened.file.description),
@@ -75,12 +75,12 @@ def run_plan(
             if recorder is not None:
                 summary = recorder.stop(scheduled)
         last_word: Mapping[str, Any] = {}
-        if output.care is not None and output.heart is not None:
-            if output.heart.noticed_ns:
-                run.counts.noticed.setdefault("no command for a while (guardian)", output.heart.noticed_ns)
-            # before the emulated world ends: the guardian may still have something to do
+        if output.lifecycle is not None:
+            if late_ns := output.lifecycle.heartbeat.late_beat_ns:
+                run.counts.noticed.setdefault("no command for a while (guardian)", late_ns)
+            # before the emulated world ends, because the guardian may still have to ramp the outputs
             so_far = interrupts()
-            last_word = output.care.finish(hurry=lambda: interrupts() > so_far)
+            last_word = output.lifecycle.stop(is_interrupted=lambda: interrupts() > so_far)
         outcome = make_outcome(request, opened, run, parts.identities, Ending(report, summary, last_word))
         outcome |= instrument.report()
         outcome["host"] = describe_host(opened, run.host_gaps, cpu_share)
