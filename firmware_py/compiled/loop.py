@@ -332,7 +332,7 @@ class CompiledMicron(Micron):
             case at.STREAM:
                 self.scans.hand_over(self._failed_block)
             case at.GAP:
-                self.run.host_gaps.look(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
+                self.run.host_gaps.record(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
             case at.DEAF:
                 silent_ms = (self.run.clock.now_ns() - int(words[at.BEAT_NS])) * 1e-6
                 self.run.incidents.report(Finding.SUPERVISION_SILENT, silent_ms=silent_ms)

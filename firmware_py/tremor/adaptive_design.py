@@ -28,13 +28,16 @@ from hal.arrays import Array, ComplexArray
 GRID_STEP_HZ = 0.02
 GRID_STOP_HZ = 250.0
 AXES = 3
-OUTPUTS = 3  # now, ahead, the part of ahead in the core band
-LEVELS = 2  # calm, burst
+OUTPUTS = 3
+"""Number of a filter's outputs: tremor now, tremor a loop delay later, the part of the latter in the core band."""
+LEVELS = 2
+"""Number of levels of motion: calm, burst."""
 
 
 @dataclass(frozen=True)
 class Bank:
-    """Resonators z <- p z + (1 - |p|) y (two states each), low-passes, and the sample itself; of each channel."""
+    """Describes the filter bank: for each channel resonators z <- p z + (1 - |p|) y (two states each), low-passes, and
+    the sample itself, in this order."""
 
     pole: ComplexArray
     slow: Array
@@ -50,7 +53,7 @@ class Bank:
         return self.channels * self.one
 
     def response(self, z: ComplexArray) -> ComplexArray:
-        """(one, len(z)) from a channel's sample to its features, z = exp(j w / rate)."""
+        """Return the response (one, n) from a channel's sample to its features at ``z`` (n,) = exp(j w / rate)."""
         p, gain = self.pole[:, None], 1.0 - np.abs(self.pole[:, None])
         one, other = gain / (1.0 - p / z), gain / (1.0 - np.conj(p) / z)
         out = np.ones((self.one, len(z)), dtype=np.complex128)
@@ -120,13 +123,14 @@ class _Spectra:
 
 
 def bank_of(config: AdaptiveConfig, tick_hz: float, channels: int = 1) -> Bank:
+    """Return the filter bank that ``config`` describes, for samples at ``tick_hz``."""
     centre = np.asarray(config.centres_hz)
     pole = np.exp((-pi * config.bandwidth_hz + 2j * pi * centre) / tick_hz)
     return Bank(pole, np.exp(-2.0 * pi * np.asarray(config.slow_hz) / tick_hz), channels)
 
 
 def motion_in_channels(config: TremorConfig) -> Array:
-    """(C, C): covariance of the channels for a motion of the tip of unit variance.
+    """Return the covariance (C, C) of the channels for a motion of the tip of unit variance.
 
     The prior hand's turn about the point that is known best is independent of that point's own motion and has
     ``lever_share`` of the variance. It turns about the arm as much as across it, independently.
@@ -139,7 +143,7 @@ def motion_in_channels(config: TremorConfig) -> Array:
 
 
 def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
-    """(C, C): covariance of the channels' noise for noise of the tip of unit variance."""
+    """Return the covariance (C, C) of the channels' noise for noise of the tip of unit variance."""
     if config.lever is None:
         return np.ones((1, 1))
     if config.lever.noise is None:
@@ -151,7 +155,7 @@ def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
 
 
 def lever_signals(lever: LeverConfig) -> Array:
-    """(3, C, 6): the channels of each axis, from the tip's specific force and the angular acceleration.
+    """Return (3, C, 6), which gives the channels of each axis from the tip's specific force and angular acceleration.
 
     They are the tip's own, arm x alpha along the axis (the turn's part of it) and arm . alpha (the turn about the arm).
     """
@@ -165,7 +169,7 @@ def lever_signals(lever: LeverConfig) -> Array:
 
 @dataclass(frozen=True)
 class Lean:
-    """Noise that gravity carries into the tip's acceleration, as it depends on up (3,) in the body.
+    """Describes the noise that gravity carries into the tip's acceleration, as a function of up (3,) in the body frame.
 
     Noise alpha turns the estimated attitude by -alpha / w^2, and so gravity by g up x alpha / w^2. ``by_up`` (3, C, 3)
     times up gives the covariance of each channel of an axis with the tip's along it, to be divided by w^2;
@@ -209,7 +213,7 @@ def sensor_noise(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
 
 
 def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
-    """(m, m): the bank's covariance under ``quiet`` times the sensor's noise above the cancelled band.
+    """Return the bank's covariance (m, m) for ``quiet`` times the sensor's noise above the cancelled band.
 
     The penalty rises over one octave from the upper edge of the band and holds up to half the tick rate. A tip has
     nothing to cancel there: all that a filter passes shakes it, and the stacks' resonance amplifies it
@@ -225,7 +229,7 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
 
 
 def shaking_power(config: TremorConfig, hz: Array) -> Array:
-    """Return (n,): how much of the power of a command at (n,) ``hz`` below half the tick rate shakes the actuators.
+    """Return the share (n,) of a command's power at ``hz`` (n,), below half the tick rate, that shakes the actuators.
 
     A command is held for a tick. So its spectrum repeats about the tick rate, under the hold's sinc, and the first
     image can lie on the actuators' resonance although the command itself cannot. The resonance is anywhere in
@@ -244,7 +248,7 @@ def shaking_power(config: TremorConfig, hz: Array) -> Array:
 
 
 def spectra(config: TremorConfig, axis: int = 0) -> _Spectra:
-    """The prior hand in the sensor's eyes."""
+    """Return the spectra of the prior hand as the sensor measures them along ``axis``."""
     a = config.adaptive
     hz = np.arange(GRID_STEP_HZ, min(GRID_STOP_HZ, 0.5 * config.tick_hz), GRID_STEP_HZ)
     seen = sensor_response(config, hz)
@@ -273,7 +277,8 @@ def band(hz: Array, edges_hz: tuple[float, float, float, float]) -> Array:
 def target_taps(
     config: TremorConfig, block_ticks: int, advance_s: float, edges_hz: tuple[float, float, float, float]
 ) -> Array:
-    """(L,) taps on block means that give displacement in ``band``, L // 2 blocks ago plus ``advance_s``.
+    """Return taps (L,) on block means that give the displacement (m) in the band ``edges_hz``, L // 2 blocks ago plus
+    ``advance_s``.
 
     Least squares over frequency of the displacement's error: fully counted where ``band`` is 0 or 1, a tenth on its
     edges; below the first edge by what voluntary motion and drift are there against a tremor of the prior's size.
@@ -314,7 +319,8 @@ def block_response(hz: Array, block_ticks: int, tick_hz: float) -> ComplexArray:
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve a positive definite system whose unknowns differ in size. Return (k, m) for ``right`` (k, m)."""
+    """Solve a positive definite system (m, m) whose unknowns differ in size. Return (k, m) for ``right`` (k, m). Raises
+    ``LinAlgError`` for a singular matrix, which no valid configuration gives."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-9 * np.eye(len(matrix))
     return np.asarray(np.linalg.solve(scaled, (right * scale).T).T * scale)
@@ -325,7 +331,7 @@ def _complex(x: Any) -> ComplexArray:
 
 
 def _polynomial(coefficients: Array, x: ComplexArray) -> ComplexArray:
-    """c0 + c1 x + c2 x^2"""
+    """Return c0 + c1 x + c2 x^2."""
     return coefficients[0] + x * (coefficients[1] + x * coefficients[2])
 
 
@@ -520,6 +526,7 @@ def _covariance(features: ComplexArray, density: Array, channels: Array) -> Arra
 
 
 def _cross(features: ComplexArray, density: ComplexArray | Array, channel: Array) -> Array:
-    """(m,): features of all channels with a signal that ``channel`` (C,) relates to each of them."""
+    """Return the cross-covariance (m,) of all channels' features with a signal that ``channel`` (C,) relates to
+    them."""
     of_tip = np.real(np.conj(features) @ density) * GRID_STEP_HZ
     return np.asarray(np.kron(channel, of_tip), dtype=np.float64)

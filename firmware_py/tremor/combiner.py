@@ -15,7 +15,7 @@ from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
-from firmware_py.tremor.seen import Seen, seen_params, undo
+from firmware_py.tremor.sensor_model import SensorModel, invert_sensor, sensor_params
 from firmware_py.tremor.wflc import WflcParams, WflcState, wflc_params, wflc_step
 from hal.arrays import Array
 from hal.compiled import kernel
@@ -25,10 +25,10 @@ TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the star
 
 @record
 class CombinerParams:
-    """Numbers of the WFLC and of the FLC that trails it."""
+    """Holds the parameters of the WFLC and of the FLC that trails it."""
 
     wflc: WflcParams = field("")
-    seen: Seen = field("")
+    sensor: SensorModel = field("")
     sections: Array = field("1", 3, 5)  # of the prefilter
     trailing_gain: float = field("1")
     bias_gain: float = field("1")
@@ -38,7 +38,7 @@ class CombinerParams:
 
 @record
 class CombinerState:
-    """An axis: the WFLC, its prefilter, and the FLC's weights."""
+    """Holds the state of one axis: the WFLC, its prefilter, and the FLC's weights."""
 
     wflc: WflcState = field("")
     memory: Array = field("sample", 3, 2)  # of the prefilter
@@ -51,7 +51,7 @@ def combiner_params(config: TremorConfig) -> Records[CombinerParams]:
     return new(
         CombinerParams,
         wflc=wflc_params(config.wflc, config.tick_hz),
-        seen=seen_params(config),
+        sensor=sensor_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
         trailing_gain=config.wflc.trailing_gain,
         bias_gain=config.wflc.bias_gain,
@@ -95,7 +95,9 @@ def combiner_displacement(state: CombinerState, params: CombinerParams, ahead_s:
     elif params.weights_of == OWN:
         size = sqrt(state.wflc.power)
         sine, cosine, filtered = size * state.wflc.sine, size * state.wflc.cosine, True
-    phasor = (cosine - 1j * sine) * exp(1j * phase) * undo(omega * params.seen.tick_hz, ahead_s, params.seen)
+    phasor = (
+        (cosine - 1j * sine) * exp(1j * phase) * invert_sensor(omega * params.sensor.tick_hz, ahead_s, params.sensor)
+    )
     if filtered:
         phasor /= prefilter_gain(params.sections, omega)
     return phasor.real

@@ -30,7 +30,7 @@ BANDS = 2
 
 @record
 class DetectParams:
-    """Numbers of both detectors."""
+    """Holds the parameters of both detectors."""
 
     sections: Array = field("1", BANDS, SECTIONS, 5)
     chi2: Array = field("1", BANDS)
@@ -47,7 +47,7 @@ class DetectParams:
 
 @record
 class DetectState:
-    """The detectors' memory."""
+    """Holds the detectors' memory."""
 
     memory: Array = field("m/s^2", BANDS, 3, SECTIONS, 2)
     power: Array = field("m^2/s^4", BANDS, 3)

@@ -2,7 +2,7 @@
 otherwise.
 
 Ripple and attenuation are not printed there; they are parameters here. Its response is known exactly at any
-frequency, so whoever uses its output can undo phase and gain.
+frequency, so phase and gain of its output can be inverted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ SECTIONS = 3
 
 
 def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64]:
-    """Three second-order sections (3, 5): b0 b1 b2 a1 a2; those that a lower order does not need let all pass."""
+    """Return three second-order sections (3, 5): b0 b1 b2 a1 a2. Sections that a lower order does not need have gain
+    1."""
     ripple = [config.ripple_dB, config.attenuation_dB] if config.prefilter == "elliptic" else []
     name = "ellip" if config.prefilter == "elliptic" else "butter"
     edges = [config.low_hz, config.high_hz]
@@ -34,7 +35,7 @@ def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64
 def prefilter_response(
     sections: NDArray[np.float64], frequency_hz: NDArray[np.float64], tick_hz: float
 ) -> NDArray[np.complex128]:
-    """Complex gain at the given frequencies, from the coefficients."""
+    """Return the complex gain (n,) of ``sections`` (k, 5) at ``frequency_hz`` (n,)."""
     delay = np.exp(-2j * pi * np.asarray(frequency_hz, dtype=np.float64) / tick_hz)
     gain = np.ones_like(delay)
     for b0, b1, b2, a1, a2 in sections:
@@ -55,7 +56,7 @@ def prefilter_step(x: float, memory: NDArray[np.float64], sections: NDArray[np.f
 
 @kernel
 def prefilter_gain(sections: NDArray[np.float64], omega: float) -> complex:
-    """Complex gain at ``omega`` rad per sample."""
+    """Return the complex gain at ``omega`` rad/sample."""
     z = exp(-1j * omega)
     gain = 1.0 + 0.0j
     for j in range(len(sections)):
