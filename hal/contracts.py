@@ -145,9 +145,11 @@ class AnalogOutput(Protocol):
         ...
 
     def write(self, values_V: Array) -> int:
-        """Output ``values_V`` (n_channels,) in V. Return a bit mask of the channels that were clipped or slew limited.
+        """Output ``values_V`` (n_channels,) in V at the load.
 
-        Raises ``SafetyTrip`` before ``arm()`` and on a value that is not finite. Never raises for clipping.
+        Return a bit mask: bit i is set if channel i was clipped to its limits or slew limited, so 0 means that no
+        value was changed. Clipping is no error. Raises ``SafetyTrip`` before ``arm()`` and for a value that
+        is not finite; nothing is output then. Raises what the bus raises if the transfer fails.
         """
         ...
 

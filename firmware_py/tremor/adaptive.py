@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.biquads import biquad_step
 from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, design_adaptive
 from firmware_py.tremor.config import TremorConfig
@@ -306,15 +307,6 @@ def _filtered(state: AdaptiveState, axis: int, output: int) -> float:
         calm += state.filter[axis, 0, output, j] * bank[j]
         burst += state.filter[axis, 1, output, j] * bank[j]
     return calm + state.burst[axis] * (burst - calm)
-
-
-@kernel
-def biquad_step(sample: float, memory: Array, c: Array) -> float:
-    """Filter one sample through b0 b1 b2 a1 a2; ``memory`` (2,), transposed direct form II."""
-    out = c[0] * sample + memory[0]
-    memory[0] = c[1] * sample - c[3] * out + memory[1]
-    memory[1] = c[2] * sample - c[4] * out
-    return out
 
 
 @kernel

@@ -11,10 +11,11 @@ from __future__ import annotations
 from cmath import exp
 from math import pi, sqrt
 
+from firmware_py.biquads import cascade_step
 from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
-from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
+from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections
 from firmware_py.tremor.sensor_model import SensorModel, invert_sensor, sensor_params
 from firmware_py.tremor.wflc import WflcParams, WflcState, wflc_params, wflc_step
 from hal.arrays import Array
@@ -69,7 +70,7 @@ def combiner_state(config: TremorConfig) -> Records[CombinerState]:
 @kernel
 def combiner_step(sample: float, state: CombinerState, params: CombinerParams) -> None:
     """Process one sample, taken behind the RC filter."""
-    in_band = prefilter_step(sample, state.memory, params.sections)
+    in_band = cascade_step(sample, state.memory, params.sections)
     wflc_step(in_band, state.wflc, params.wflc)
     state.fixed_phase = (state.fixed_phase + params.wflc.start) % (2.0 * pi)
     phase = state.fixed_phase if params.weights_of == FIXED else state.wflc.phase

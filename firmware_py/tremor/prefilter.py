@@ -8,7 +8,6 @@ frequency, so phase and gain of its output can be inverted.
 from __future__ import annotations
 
 from cmath import exp
-from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,28 +29,6 @@ def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64
     sections = np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (SECTIONS, 1))
     sections[: len(sos)] = sos[:, [0, 1, 2, 4, 5]]
     return sections
-
-
-def prefilter_response(
-    sections: NDArray[np.float64], frequency_hz: NDArray[np.float64], tick_hz: float
-) -> NDArray[np.complex128]:
-    """Return the complex gain (n,) of ``sections`` (k, 5) at ``frequency_hz`` (n,)."""
-    delay = np.exp(-2j * pi * np.asarray(frequency_hz, dtype=np.float64) / tick_hz)
-    gain = np.ones_like(delay)
-    for b0, b1, b2, a1, a2 in sections:
-        gain = gain * (b0 + b1 * delay + b2 * delay**2) / (1.0 + a1 * delay + a2 * delay**2)
-    return gain
-
-
-@kernel
-def prefilter_step(x: float, memory: NDArray[np.float64], sections: NDArray[np.float64]) -> float:
-    """Filter one sample through the sections; ``memory`` (n, 2), direct form II transposed."""
-    for j in range(len(sections)):
-        y = sections[j, 0] * x + memory[j, 0]
-        memory[j, 0] = sections[j, 1] * x - sections[j, 3] * y + memory[j, 1]
-        memory[j, 1] = sections[j, 2] * x - sections[j, 4] * y
-        x = y
-    return x
 
 
 @kernel

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from firmware_py.biquads import cascade_step
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
-from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sections, prefilter_step
+from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sections
 from firmware_py.tremor.sensor_model import invert_sensor, sensor_params
 from hal.arrays import Array
 from hal.compiled import kernel
@@ -200,7 +201,7 @@ def _correct(sample: float, axis: Weights, comb: Comb) -> None:
     """Process the sample of the present tick."""
     size, w, x = comb.size, axis.weights, axis.regressor
     if comb.behind_prefilter:
-        sample = prefilter_step(sample, axis.filter, comb.sections)
+        sample = cascade_step(sample, axis.filter, comb.sections)
     error = sample - w[2 * size]
     for r in range(size):
         x[2 * r], x[2 * r + 1] = axis.phasor[r].imag, axis.phasor[r].real
