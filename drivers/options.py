@@ -171,8 +171,8 @@ class CanTelemetryOptions(Options):
 
 
 class MotionCardOptions(Options):
-    """Holds the keys of a motion card behind its scanner card. ``fields`` says if the text carries counts or g, deg/s,
-    degC."""
+    """Holds the keys of a motion card behind its scanner card. ``fields``: the text carries counts ("raw"), or g,
+    deg/s and degC ("scaled")."""
 
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
     fields: Literal["raw", "scaled"] = "raw"

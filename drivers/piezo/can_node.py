@@ -130,7 +130,7 @@ def must_ask(node: NodeMemory, now_ns: int) -> bool:
 
 
 def is_safe(node: NodeMemory) -> bool:
-    """Return True, and begin anew, once the node says that it is disarmed: its outputs are at the safe state."""
+    """Return True once the node reports that it is disarmed, with its outputs at the safe state; then count anew."""
     words = node.words
     if words[STATE] != DISARMED or words[STATUS_NS] <= words[ASKED_NS]:
         return False

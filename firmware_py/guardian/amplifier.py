@@ -84,7 +84,7 @@ class GuardedAmplifier:
     def safe_step(self) -> bool:
         """Make one step of the ramp, or wait for the guardian's ramp. Return True once neutral is read back."""
         self._accept_outputs()
-        if (self.gate.lost or self._heartbeat.taken_ns) and not self._has_regained_outputs():
+        if (self.gate.lost or self._heartbeat.taken_ns) and not self._regain_outputs():
             return self._has_requested
         done = self.inner.safe_step()
         if done:
@@ -98,7 +98,7 @@ class GuardedAmplifier:
         """Take the outputs to neutral unless they are there. Raises ``HalError`` if neutral cannot be confirmed; the
         guardian then goes on trying."""
         while self.gate.lost or self._heartbeat.taken_ns:
-            if self._has_regained_outputs():
+            if self._regain_outputs():
                 self.inner.safe_step()
             elif self._has_requested:
                 break  # the guardian has read neutral back
@@ -136,10 +136,10 @@ class GuardedAmplifier:
             self._has_requested, self._lost_ns, self._codes = False, 0, None
             self.gate.clear_loss()
 
-    def _has_regained_outputs(self) -> bool:
-        """Return True if this process must ramp the outputs itself, because the guardian has not reached neutral in
-        time; the guardian is killed first. If the guardian has reached neutral, ask for the outputs and return False.
-        """
+    def _regain_outputs(self) -> bool:
+        """Take the outputs back from a guardian that has not reached neutral in time: kill it and return True, so that
+        this process ramps them. If the guardian has reached neutral, ask for the outputs and return False; if it is
+        still at work, return False."""
         heartbeat, now_ns = self._heartbeat, self._clock.now_ns()
         # a command that was under way may have moved the outputs from neutral after the guardian had reached it
         if heartbeat.neutral_ns and heartbeat.confirmed_ns >= self.gate.transfer_end_ns:

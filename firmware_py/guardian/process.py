@@ -202,7 +202,7 @@ def main(arguments: list[str]) -> int:
         run_guardian(guardian, heartbeat, clock, settings["pipe"])
     report = guardian.report()
     partial = Path(settings["report"] + ".partial")
-    with suppress(OSError):  # whoever wanted it may have cleaned up
+    with suppress(OSError):  # the run may have removed its folder already
         partial.write_text(json.dumps(report), encoding="utf-8")
         partial.rename(settings["report"])
     if report["why"] != TakeoverReason.NOTHING.name.lower():

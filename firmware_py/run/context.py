@@ -1,4 +1,4 @@
-"""Holds what every part of a running instrument uses: clock, limits, counters, supervisor, and who is told."""
+"""Holds what every part of a running instrument uses: clock, limits, counters, supervisor, recorder and page."""
 
 from __future__ import annotations
 

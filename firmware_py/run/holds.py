@@ -15,7 +15,7 @@ OPERATOR = "the operator"
 
 
 class Holds:
-    """Counts holds and decides when one may end. ``waits_for`` says in words what the hold waits for.
+    """Counts holds and decides when one may end. ``waits_for`` is a text for display: what the hold waits for.
 
     ``allows_host_stalls``: a hold that this host has caused does not count towards ``holds_per_minute``.
     """

@@ -22,7 +22,7 @@ class Signals:
         handlers = {signal.SIGINT: self._interrupt, signal.SIGTERM: self._interrupt, signal.SIGUSR1: self._rearm}
         try:
             previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-        except ValueError:  # not the main thread: whoever started the loop there handles signals
+        except ValueError:  # not the main thread, which alone can handle signals
             previous = {}
         try:
             yield

@@ -1,5 +1,5 @@
-"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (Ang 2004, 5.2.1; erratum 56), unless told
-otherwise.
+"""Designs the band-pass in front of the WFLC. The default is elliptic, sixth order, 7-13 Hz (Ang 2004, 5.2.1; erratum
+56).
 
 Ripple and attenuation are not printed there; they are parameters here. Its response is known exactly at any
 frequency, so phase and gain of its output can be inverted.
