@@ -1,12 +1,12 @@
-"""Monitor outputs of a piezo amplifier, or sense wires at the stacks, read by an ADC and compared with the commands.
+"""Compares the measured outputs of a piezo amplifier with the commands, through an ADC.
 
-The converter averages over its conversion, so what is measured must be a mean of the commands that were in force
-meanwhile, each with a weight between the shortest and the longest time that it can have been in force: no model of
-the amplifier is needed, only how long it may take to settle. What a healthy output differs by (gain and offset of
-amplifier and divider) is learnt within the tolerance where the commands are known well enough, and a change of it is
-as suspicious as a difference beyond the tolerance. A suspicious output is looked at once more before anything is said.
-Wired to the stack's terminals it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier
-only.
+The ADC reads the amplifier's monitor outputs, or sense wires at the stacks; only the latter show a broken cable.
+
+The converter averages over its conversion, so a reading must be a mean of the commands that were in force meanwhile,
+each with a weight between the shortest and the longest time that it can have been in force. This needs no model of the
+amplifier, only its longest settling time. The difference of a healthy output (gain and offset of amplifier and divider)
+is learned within the tolerance where the commands are known well enough, and a change of it is as suspicious as a
+difference beyond the tolerance. A suspicious output is measured once more before it is reported.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from drivers.adc.ads1115 import EXCHANGE_NS, ORDER_NS, RATE_TOLERANCE, WAKE_UP_N
 from drivers.options import AmplifierMonitorOptions
 from drivers.output_guard import OutputGuard
 from drivers.registry import Driver
-from hal.contracts import Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import Clock
 
 GROSS = 8.0
-"""Deviation, as a multiple of the tolerance, that one reading proves: neither noise nor a model error is as large."""
+"""Deviation, as a multiple of the tolerance, at which one reading is enough to report the output."""
 
 
 class Window(NamedTuple):
@@ -36,9 +37,9 @@ class Window(NamedTuple):
 
 
 MEMORY = 240
-"""Number of readings of an output after which an older one counts 1/e in what is usual."""
+"""Number of readings of an output after which an older one has the weight 1/e in the usual difference."""
 LEARN = 20.0
-"""Sum of the weights of the readings with which the usual difference of an output counts as known."""
+"""Sum of the readings' weights from which the usual difference of an output counts as known."""
 
 
 class Usual:
@@ -94,7 +95,7 @@ class AmplifierMonitor:
         name: str = "monitor",
     ) -> None:
         self.name = name
-        self.volts: Float64Array = np.full(len(channels), np.nan)
+        self.volts: Array = np.full(len(channels), np.nan)
         """Last reading of each output, V."""
         self.readings = 0
         self.suspicions = 0
@@ -115,10 +116,11 @@ class AmplifierMonitor:
         self._suspected = [False] * len(self._channels)
 
     def poll(self) -> str:
-        """Collect what is ready and start the next conversion, in one transfer; empty, or which output does not follow.
+        """Collect a finished conversion and start the next one, in one transfer. Return a message that names the output
+        which does not follow its commands, else an empty text.
 
-        Which one is next is said before the reading is known: a suspicious output is looked at again after the one that
-        follows it. Never waits. Raises what the bus raises.
+        The next output is ordered before the reading is known, so a suspicious output is measured again after the one
+        that follows it. Never waits. Raises what the bus raises.
         """
         asked_ns = self._clock.now_ns()
         if self._adc.pending is None:
@@ -145,7 +147,7 @@ class AmplifierMonitor:
         return Window(self._ordered_ns, self._started_ns + WAKE_UP_NS, self._longest_ns, self._shortest_ns)
 
     def _following(self) -> int:
-        """The output to convert after the one that is being read: a suspected one, else in turn."""
+        """Return the output to convert after the one that is being read: a suspicious one, else the next in turn."""
         for output, suspected in enumerate(self._suspected):
             if suspected and output != self._output:
                 return output

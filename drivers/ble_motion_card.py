@@ -1,6 +1,6 @@
 """Reads a motion card without its scanner card: 15-byte packets and battery level over Bluetooth Low Energy.
 
-Source: Erat 2018 (Erat 2018), 4.3.2 (services and characteristics) and Fig. 4.13. Tested against a stand-in for
+Source: Erat 2018, 4.3.2 (services and characteristics) and Fig. 4.13. Tested against a stand-in for
 the Bluetooth stack, never yet against a radio.
 """
 
@@ -24,7 +24,7 @@ RECEIVE_LIMIT = 64
 
 
 class BleMotionCard(QueuedCard):
-    """``probe`` subscribes, ``read`` gives the oldest sample not yet used and never waits."""
+    """Reads one card. ``probe`` subscribes; ``read`` returns the oldest unread sample and never waits."""
 
     def __init__(
         self,
@@ -45,7 +45,8 @@ class BleMotionCard(QueuedCard):
         self._timeout_s = timeout_s
 
     def probe(self) -> str:
-        """Read the battery, switch both notifications on, wait for a good packet."""
+        """Read the battery, switch both notifications on, and wait for a good packet. Raises ``HalTimeout`` if none
+        comes."""
         try:
             self.battery_percent = decode_battery(self._link.read(BATTERY_CHARACTERISTIC, self._timeout_s))
         except ValueError as error:

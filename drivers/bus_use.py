@@ -1,8 +1,8 @@
-"""Compute each device's load on its bus from the transactions that its driver declares and the firmware's task rates.
+"""Computes each device's load on its bus from the transactions that its driver declares and the firmware's task rates.
 
 An I2C bus gives ``speed_hz`` bits a second, a serial line ``baud``, a CAN bus ``bitrate`` with the worst case of stuff
-bits. A bus is refused that is asked for more than ``MOST`` of its time: what is left has to carry retries, the reads of
-a supervisor and the gaps that real adapters leave between bytes.
+bits. A bus with a load above ``MOST`` is refused: the rest carries retries, the reads of a supervisor and the gaps that
+real adapters leave between bytes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drivers.registry import Load, find_driver
 from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec
 
 MOST = 0.8
-"""Largest part of its time that a bus may be asked for."""
+"""Largest load of a bus, as a fraction of its time."""
 TOP_BITRATE = 1_000_000  # CAN with classic frames
 
 
@@ -39,7 +39,7 @@ class BusUse:
 
     @property
     def bus_us(self) -> float:
-        """Time on the wire of one transaction, us."""
+        """Return the time of one transaction on the wire, us."""
         return 1e6 * self.share / self.per_s
 
     def __str__(self) -> str:
@@ -47,7 +47,7 @@ class BusUse:
 
 
 def bus_uses(description: BenchDescription, options: Mapping[str, Any], polling: Polling) -> list[BusUse]:
-    """Everything that the devices of a bench ask of their buses over and over, in the order of the file."""
+    """Return all transactions that the devices of a bench repeat, in the order of the file."""
     uses: list[BusUse] = []
     with_heartbeat: set[str] = set()
     for name, spec in description.device.items():

@@ -1,4 +1,4 @@
-"""Parts that the CAN drivers share: the heartbeat of this host."""
+"""Sends the heartbeat of this host, which the CAN drivers of one bus share."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ HEARTBEAT_BYTES = 1
 
 
 BEAT_DUE_NS, BEAT_STATE, BEATS, BEAT_WORDS = range(4)
-"""Places in ``HostHeartbeat.words``: when the next one is due, its data byte, and how many were sent."""
+"""Places in ``HostHeartbeat.words``: due time of the next one (bench clock, ns), its data byte, number sent."""
 
 
 class HostHeartbeat:
-    """HOST_HEARTBEAT at 50 Hz, sent by whoever calls ``beat`` often enough. One per bus and process.
+    """Sends HOST_HEARTBEAT at 50 Hz; call ``beat`` at that rate or more often. There is one per bus and process.
 
     A compiled loop sends it over the same ``words``."""
 
@@ -32,7 +32,7 @@ class HostHeartbeat:
 
     @property
     def state(self) -> int:
-        """The data byte."""
+        """Return the data byte, which is the supervisor's state."""
         return self.words[BEAT_STATE]
 
     @state.setter
@@ -44,7 +44,7 @@ class HostHeartbeat:
         return self.words[BEATS]
 
     def beat(self) -> None:
-        """Send if 20 ms have passed since the last one."""
+        """Send a heartbeat if one is due, every 20 ms."""
         words, now_ns = self.words, self._clock.now_ns()
         if now_ns < words[BEAT_DUE_NS]:
             return

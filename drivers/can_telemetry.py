@@ -1,4 +1,4 @@
-"""Telemetry frames out, stop button in, over CAN (``drivers/dbc/micron.dbc``)."""
+"""Sends telemetry frames and receives the stop button over CAN (``drivers/dbc/micron.dbc``)."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ BUTTON_LIMIT_NS = 1_500_000_000  # three heartbeats of the button
 RECEIVE_LIMIT = 32
 BUTTON_HZ = 10.0  # while it is pressed; 2 Hz otherwise (micron.dbc)
 FRAMES = {"TELEMETRY_TREMOR": 8, "TELEMETRY_STATE": 8, "STOP_BUTTON": 2}
-"""Data bytes of what is repeated: the first two by ``send_tremor`` and ``send_state``, the last by the button."""
+"""Data bytes of the repeated frames: the first two are sent by ``send_tremor`` and ``send_state``, the last by the
+button."""
 
 
 class CanTelemetry:
-    """Call ``poll`` at the rate of the supervisor; it also keeps the host heartbeat going."""
+    """Sends telemetry and watches the stop button. ``poll``, called at the supervisor's rate, also sends the host's
+    heartbeat."""
 
     def __init__(
         self, bus: CanBus, clock: Clock, *, heartbeat: HostHeartbeat | None = None, name: str = "telemetry"
@@ -41,11 +43,11 @@ class CanTelemetry:
 
     @staticmethod
     def receives() -> tuple[int, ...]:
-        """CAN ids for ``SharedCan.view``."""
+        """Return the CAN ids that it receives, for ``SharedCan.view``."""
         return (load_database().get_message_by_name("STOP_BUTTON").frame_id,)
 
     def poll(self) -> bool:
-        """Take what has arrived; True while the stop button is pressed. Never waits."""
+        """Process the frames that have arrived. Return True while the stop button is pressed. Never waits."""
         self.heartbeat.beat()
         for _ in range(RECEIVE_LIMIT):
             frame = self._bus.recv(0.0)
@@ -59,7 +61,7 @@ class CanTelemetry:
         return self.stop_pressed
 
     def button_silent(self) -> bool:
-        """True when the button has not been heard for 1.5 s, or never: it can then not stop anything."""
+        """Return True if no frame of the button has come for 1.5 s, so that it could not stop anything."""
         return self.button_ns == 0 or self._clock.now_ns() - self.button_ns > BUTTON_LIMIT_NS
 
     def send_tremor(self, amplitude_um: Sequence[float], frequency_Hz: float) -> None:
@@ -79,7 +81,8 @@ class CanTelemetry:
         )
 
     def send_state(self, state: int, flags: int, lost_samples: int, skipped_ticks: int, worst_tick_us: float) -> None:
-        """Send the condition of the loop. Counts stop at 65535."""
+        """Send the state of the loop: supervisor's state, status bits of the frame, counters up to 65535, and the
+        longest tick in us."""
         self._send(
             self._state.frame_id,
             self._state.encode(

@@ -15,7 +15,8 @@ from drivers.adc.ads1115 import Ads1115
 from drivers.base import DigitalOutput
 from drivers.options import Hmc2003Options
 from drivers.registry import Driver
-from hal.contracts import Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import Clock
 from hal.errors import HalTimeout
 from hal.types import ChannelInfo
 
@@ -41,8 +42,8 @@ class Hmc2003:
     ) -> None:
         self.name = name
         self.offset_V = np.full(3, ZERO_FIELD_V)
-        self.volts: Float64Array = np.full(3, np.nan)
-        self.field_T: Float64Array = np.full(3, np.nan)
+        self.volts: Array = np.full(3, np.nan)
+        self.field_T: Array = np.full(3, np.nan)
         self.t_ns = 0
         self.triples = 0
         self._adc = adc
@@ -76,7 +77,7 @@ class Hmc2003:
         self.triples += 1
         return True
 
-    def measure_offset(self, triples: int = 4, timeout_s: float = 1.0) -> Generator[None, None, Float64Array]:
+    def measure_offset(self, triples: int = 4, timeout_s: float = 1.0) -> Generator[None, None, Array]:
         """Set, read, reset, read, set again: takes over and returns ``offset_V`` (3,).
 
         A background task: yields instead of waiting. The instrument must be at rest meanwhile. Raises
@@ -87,7 +88,7 @@ class Hmc2003:
         self.offset_V[:] = 0.5 * (after_set + after_reset)
         return self.offset_V.copy()
 
-    def _after_pulse(self, bit: int, triples: int, timeout_s: float) -> Generator[None, None, Float64Array]:
+    def _after_pulse(self, bit: int, triples: int, timeout_s: float) -> Generator[None, None, Array]:
         limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         self._strap.write_digital(bit)
         yield from self._until(self._clock.now_ns() + PULSE_NS)

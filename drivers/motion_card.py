@@ -1,7 +1,7 @@
 """Reads a motion card behind its scanner card: six axes, temperature and the activation button as text on a serial
 line.
 
-Source: Erat 2018 (Erat 2018), section 4.2; formats in ``drivers.motion_card_protocol``. The card's MPU-6050 runs
+Source: Erat 2018, section 4.2; formats in ``drivers.motion_card_protocol``. The card's MPU-6050 runs
 at 2 g, 2000 deg/s and 100 Hz. The line has no field for the battery: that level is only on the air (4.3.2).
 """
 
@@ -32,10 +32,11 @@ PROBE_TRIES = 8
 
 
 class CardQueue:
-    """Readings that wait to be used, in SI, with time and status; the same for wire and air.
+    """Queues readings, in SI units with time and status, of cards on a serial line or over Bluetooth.
 
-    ``card_status`` is the newest one given out. The wire says only the button's result, so the spike filter takes
-    every change of status for a release: for 20 ms after it samples are ``Status.STALE`` and repeat the last one.
+    ``card_status`` is that of the sample that was read last. A message carries only the button's result, so the spike
+    filter takes every change of status for a release: for 20 ms after it samples are ``Status.STALE`` and repeat the
+    last one.
     """
 
     def __init__(self, rate_hz: float, fields: Fields, *, spike_filter: bool) -> None:
@@ -68,7 +69,7 @@ class CardQueue:
             self._dropped += 1
 
     def take(self, out: ImuSample) -> Status:
-        """Move the oldest reading into ``out``; returns ``STALE`` if there is none."""
+        """Move the oldest reading into ``out`` and return its status. Without one, repeat the last one as ``STALE``."""
         status = Status.STALE
         out.lost = 0
         if self._waiting:
@@ -117,12 +118,13 @@ class QueuedCard:
 
     @property
     def clicks(self) -> int:
-        """Changes of the card's status so far."""
+        """Return the number of changes of the card's status so far."""
         return self._queue.clicks
 
     @property
     def lost(self) -> int:
-        """Readings thrown away because ``read`` was not called; what could not be decoded is in ``bad_frames``."""
+        """Return the number of readings that were discarded because ``read`` was not called in time. Messages that
+        could not be decoded are counted in ``bad_frames``."""
         return self._queue.lost
 
     @property
@@ -131,7 +133,7 @@ class QueuedCard:
 
     @property
     def masked(self) -> int:
-        """Samples that the spike filter held back."""
+        """Return the number of samples that the spike filter held back."""
         return self._queue.spikes.held if self._queue.spikes else 0
 
     def waiting(self) -> int:
@@ -167,7 +169,7 @@ class MotionCard(QueuedCard):
         return self.parser.bad_frames
 
     def probe(self, limit_s: float = 1.0) -> str:
-        """Wait for a good line. ``HalTimeout`` when nothing comes, ``WrongDevice`` when it is something else."""
+        """Wait for a good line. Raises ``HalTimeout`` if nothing comes, ``WrongDevice`` if something else comes."""
         limit_ns = self._clock.now_ns() + round(limit_s * 1e9)
         while self.parser.frames == 0:
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9

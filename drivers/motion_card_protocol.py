@@ -58,7 +58,7 @@ def decode_battery(value: bytes) -> int:
 
 
 def line_bytes(fields: Fields) -> int:
-    """Longest line that a card sends, for the load of its serial line."""
+    """Return the bytes of the longest line that a card sends, for the load of its serial line."""
     return LINE_BYTES if fields == "raw" else LONGEST_LINE
 
 
@@ -153,7 +153,7 @@ class ActivationButton:
         self._long = False
 
     def update(self, pressed: bool, t_ns: int) -> int:
-        """Take the state of the switch at ``t_ns``; returns the status."""
+        """Process the state of the switch at ``t_ns``, and return the status."""
         if self._since_ns is None:
             if pressed:
                 self._since_ns = t_ns
@@ -171,8 +171,8 @@ class ActivationButton:
 
 
 class SpikeFilter:
-    """Keeps the click's mechanical spike out (section 6.3): nothing is used while the button is pressed, nor for
-    20 ms after its release. ``held`` counts what was not used."""
+    """Rejects the mechanical spike of a click (section 6.3): no sample is used while the button is pressed, nor for
+    20 ms after its release. ``held`` counts the samples that were not used."""
 
     def __init__(self, hold_ns: int = SPIKE_NS) -> None:
         self.held = 0
@@ -180,7 +180,7 @@ class SpikeFilter:
         self._until_ns: int | None = None
 
     def admit(self, pressed: bool, t_ns: int) -> bool:
-        """May a sample of ``t_ns`` be used?"""
+        """Return True if a sample of ``t_ns`` may be used."""
         if pressed:
             self._until_ns = t_ns + self._hold_ns
         good = not pressed and (self._until_ns is None or t_ns >= self._until_ns)

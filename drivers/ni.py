@@ -1,4 +1,4 @@
-"""National Instruments cards through the ``nidaqmx`` package, which is optional and imported when a card is opened."""
+"""Registers National Instruments cards. Their package ``nidaqmx`` is optional and imported when a card is opened."""
 
 from __future__ import annotations
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from drivers.output_guard import GuardedOutput, OutputGuard
+from hal.arrays import Array
 from hal.backends import nidaqmx_package
-from hal.contracts import Clock, Float64Array
+from hal.contracts import Clock
 from hal.errors import BenchError
 from hal.types import OutputLimit
 
-TICK_NS = 1_000_000
 WRITE_TIMEOUT_S = 0.01
 READ_TIMEOUT_S = 0.5
 TOLERANCE_V = 0.02  # at the converter
@@ -77,7 +77,7 @@ class NidaqmxOutput(GuardedOutput):
         return nidaqmx_package.identify_card(self._nidaqmx, self._device, self.name, "ao", highest=self._highest)
 
     def arming(self) -> Iterator[None]:
-        """Ramp to neutral and compare what is measured with it."""
+        """Ramp to neutral and compare the measured voltages with it."""
         self._known = False
         while not self.safe_step():
             yield
@@ -89,7 +89,8 @@ class NidaqmxOutput(GuardedOutput):
         )
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
+        """Write ``values_V`` (channels,) and return the mask, both as ``AnalogOutput.write`` says."""
         mask = self.guard.admit(values_V)
         self._send()
         return mask
@@ -102,7 +103,7 @@ class NidaqmxOutput(GuardedOutput):
         self._send()
         return done
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         data = np.zeros(len(self.limits))
         try:
             self._reader.read_one_sample(data, READ_TIMEOUT_S)
@@ -114,9 +115,8 @@ class NidaqmxOutput(GuardedOutput):
         if self._out is None:
             return
         try:
-            with self.bringing_to_neutral():
-                while self._known and not self.guard.at_safe_state() and not self.safe_step():
-                    self._clock.sleep_until_ns(self._clock.now_ns() + TICK_NS)
+            if self._known:
+                self.ramp_to_neutral()
         finally:
             self._out.close()
             self._back.close()

@@ -12,7 +12,7 @@ Channel = Annotated[int, Field(ge=0, le=7)]
 
 
 class Options(BaseModel):
-    """A driver's own keys; unknown ones are refused."""
+    """Holds a driver's own keys of a bench file; unknown ones are refused. Units are in the names of the keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -45,7 +45,7 @@ class OutputOptions(Options):
 
 
 def one_of(*allowed: float) -> AfterValidator:
-    """A number that must be one of ``allowed``."""
+    """Return a validator for a number that must be one of ``allowed``."""
 
     def check(value: float) -> float:
         if value not in allowed:
@@ -105,8 +105,8 @@ class Hmc2003Options(Options):
 class AmplifierMonitorOptions(Options):
     """Holds the keys of an amplifier monitor: output volts = ADC volts x ``ratio``.
 
-    ``rate_hz``: readings per second, of one output each; two in five ticks unless said otherwise, fewer
-    where conversions take longer than that.
+    ``rate_hz``: readings per second, of one output each. The default is two in five ticks, fewer if conversions take
+    longer than that.
     """
 
     channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
@@ -120,8 +120,8 @@ class AmplifierMonitorOptions(Options):
 class DacAmplifierOptions(OutputOptions):
     """Holds the keys of an AD5696R with an amplifier: output volts = DAC volts x ``gain``.
 
-    ``read_back``: every command is read back within its own transfer; takes 0.21 ms more of the bus, and task budgets
-    that leave room for it.
+    ``read_back``: every command is read back within its own transfer, which takes 0.21 ms more on the bus; the task
+    budgets must leave room for it.
     """
 
     gain: float = Field(default=20.0, ge=0.1, le=100)
@@ -133,7 +133,7 @@ class DacAmplifierOptions(OutputOptions):
 
 
 class E727Options(OutputOptions):
-    """PI E-727 over GCS 2.0, open loop: volts are commanded as open-loop values."""
+    """Holds the keys of a PI E-727 over GCS 2.0, whose voltages are commanded in open loop."""
 
     lo_V: float = Field(default=0.0, ge=-30)
     hi_V: float = Field(default=100.0, le=120)
@@ -155,7 +155,7 @@ class NiOutputOptions(OutputOptions):
 
 
 class CanAmplifierOptions(OutputOptions):
-    """The CAN piezo node of ``drivers/dbc/micron.dbc``, whose set points reach from 0 to 100 V."""
+    """Holds the keys of the CAN piezo node (``drivers/dbc/micron.dbc``), whose set points are 0 to 100 V."""
 
     lo_V: ClassVar[float] = 0.0
     hi_V: ClassVar[float] = 100.0
@@ -165,14 +165,14 @@ class CanAmplifierOptions(OutputOptions):
 
 
 class CanTelemetryOptions(Options):
-    """Telemetry frames out, stop button in. ``stop_button`` says that a missing button heartbeat is a fault."""
+    """Holds the keys of telemetry and stop button. ``stop_button``: a missing heartbeat of the button is a fault."""
 
     stop_button: bool = True
 
 
 class MotionCardOptions(Options):
-    """Holds the keys of a motion card behind its scanner card. ``fields`` says if the text carries counts or g, deg/s,
-    degC."""
+    """Holds the keys of a motion card behind its scanner card. ``fields``: the text carries counts ("raw"), or g,
+    deg/s and degC ("scaled")."""
 
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
     fields: Literal["raw", "scaled"] = "raw"

@@ -27,18 +27,21 @@ from drivers.output_guard_steps import (
     next_ramp_step,
     note_sent,
 )
-from hal.contracts import ARMING_STEP_S, Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import ARMING_STEP_S, Clock
 from hal.errors import ErrorKind, HalError, SafetyTrip
 from hal.types import OutputLimit
 
 __all__ = ["LISTED", "RAMP_STEPS", "OutputGuard", "SentCommand"]
 
+RAMP_STEP_S = 0.001
 LISTED = KEPT - 1
 """Number of commands that ``OutputGuard.sent_commands`` yields at most."""
 
 
 class SentCommand(NamedTuple):
-    """Describes a sent command. It took effect between its two times (bench clock, ns) if the driver says no better."""
+    """Describes a sent command. It took effect between its two times (bench clock, ns); ``offered_ns`` is the earliest
+    time that the driver can state."""
 
     offered_ns: int
     sent_ns: int
@@ -46,10 +49,11 @@ class SentCommand(NamedTuple):
 
 
 class OutputGuard:
-    """Decides what may go out next; the driver sends ``next_V`` and then calls ``sent()``.
+    """Limits what a driver sends: the driver sends ``next_V`` and then calls ``sent()``.
 
-    ``last_V`` is what the device was last told. The slew allowance grows with the time since then, up to
-    ``longest_gap_s``, so that a stall does not buy one large step.
+    ``last_V`` are the set points (V) that were sent last. The step that the slew limit allows grows with the time since
+    then, up to ``longest_gap_s``, so that no large step follows a stall. Each ramp has ``ramp_steps`` steps of
+    ``ramp_step_s``.
     """
 
     def __init__(
@@ -59,7 +63,7 @@ class OutputGuard:
         clock: Clock,
         *,
         ramp_steps: int = RAMP_STEPS,
-        ramp_step_s: float = 0.001,
+        ramp_step_s: float = RAMP_STEP_S,
         longest_gap_s: float = 0.005,
     ) -> None:
         self.device = device
@@ -103,8 +107,9 @@ class OutputGuard:
             p = k % KEPT
             yield SentCommand(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n]))
 
-    def admit(self, values_V: Float64Array) -> int:
-        """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.
+    def admit(self, values_V: Array) -> int:
+        """Fill ``next_V`` (n,) from ``values_V`` (n,). Return a bit mask: bit i is set if channel i was clipped or slew
+        limited.
 
         Raises ``SafetyTrip`` when not armed, on a wrong number of values and on a value that is not finite.
         """
@@ -122,38 +127,38 @@ class OutputGuard:
     def ramp(self) -> bool:
         """Disarm and fill ``next_V`` with the next step of a straight ramp to the safe state.
 
-        True when that step is the safe state itself. Call again only after ``sent()``: a step that failed on
-        the bus is offered once more. Time that was lost is made up for, by as many steps at once as the slew limit
-        allows in the time of one.
+        Return True if that step is the safe state itself. Without ``sent()`` in between, the next call offers the same
+        step again, as after a failed transfer. After lost time a call advances by several steps, as many as the slew
+        limit allows in the time of one.
         """
         return next_ramp_step(self.state, self._clock.now_ns())
 
     def begin_ramp(self, since_ns: int) -> None:
-        """Let the ramp that ``ramp`` goes on with have begun at ``since_ns``: where the device is had to be asked since
-        then. The time is made up for as ``ramp`` says."""
+        """Start a ramp as if at ``since_ns`` (bench clock), the time before the outputs were read back. ``ramp``
+        continues it and makes up for the time since."""
         next_ramp_step(self.state, since_ns)
 
     def not_before(self, t_ns: int) -> None:
-        """``next_V`` cannot take force before ``t_ns``: its transfer takes so long."""
+        """Note that ``next_V`` cannot take effect before ``t_ns`` (bench clock), the shortest end of its transfer."""
         self.state.words[OFFERED_NS] = t_ns
 
     def sent(self, ago_ns: int = 0) -> None:
-        """The device was told ``next_V``, at least ``ago_ns`` ago."""
+        """Note that ``next_V`` was sent, at least ``ago_ns`` ago."""
         note_sent(self.state, self._clock.now_ns() - ago_ns)
 
     def start_from(self, values_V: Sequence[float]) -> None:
-        """Believe that the device is at ``values_V``: after a readback, before a ramp."""
+        """Set ``last_V`` to ``values_V`` (n,), which were read back, so that a ramp starts there."""
         for i, value_V in enumerate(values_V):
             self.state.last_V[i] = float(value_V)
         self.state.words[RAMP_DONE] = -1
 
     def offer_last(self) -> None:
-        """Make ``next_V`` what the device was last told, so that it can be sent again."""
+        """Set ``next_V`` to ``last_V``, so that the last command can be sent again."""
         for i, value_V in enumerate(self.state.last_V):
             self.state.next_V[i] = value_V
 
     def brought_to_safe_state(self) -> None:
-        """Somebody else has taken the device to its safe state and read that back."""
+        """Note that the guardian has taken the device to its safe state and read that back."""
         state, words, now_ns = self.state, self.state.words, self._clock.now_ns()
         for i, safe_V in enumerate(state.safe_V):
             state.next_V[i] = safe_V
@@ -166,7 +171,7 @@ class OutputGuard:
         return self.state.last_V == self.state.safe_V
 
     def require(self, good: bool, why: str) -> None:
-        """Raise ``SafetyTrip`` when a self-test failed."""
+        """Disarm and raise ``SafetyTrip`` unless ``good``: a self-test has failed because of ``why``."""
         if not good:
             self.armed = False
             raise SafetyTrip(f"self-test failed: {why}", kind=ErrorKind.SAFETY, device=self.device)
@@ -183,6 +188,10 @@ class GuardedOutput:
         """See ``ArmsInSteps``."""
         raise NotImplementedError
 
+    def safe_step(self) -> bool:
+        """See ``AnalogOutput``."""
+        raise NotImplementedError
+
     def arm(self) -> None:
         """Do the steps of ``arming`` one after another."""
         for _ in self.arming():
@@ -196,9 +205,15 @@ class GuardedOutput:
     def commanded_V(self) -> Sequence[float]:
         return self.guard.last_V
 
+    def ramp_to_neutral(self) -> None:
+        """Make the steps of the ramp, one per millisecond, until the outputs are at neutral."""
+        with self.bringing_to_neutral():
+            while not self.guard.at_safe_state() and not self.safe_step():
+                wait_s(self._clock, RAMP_STEP_S)
+
     @contextmanager
     def bringing_to_neutral(self, failed: str = "were NOT brought to neutral") -> Generator[None]:
-        """Let an error of the block, which brings the outputs to neutral, say that they may not be there."""
+        """Append to an error of the block, which takes the outputs to neutral, that they may not be there."""
         try:
             yield
         except HalError as error:

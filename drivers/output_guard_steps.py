@@ -27,7 +27,7 @@ KEPT = 17
     ARMED, WRITES, CLIPPED, SLEW_LIMITED, SENT_NS, OFFERED_NS, RAMP_DONE, RAMP_NEXT, RAMP_START_NS, RAMP_LONGEST,
     N_RAMP_STEPS, N_SENT, WORDS,
 ) = range(13)  # fmt: skip
-"""Places in ``GuardState.words``. ``RAMP_DONE``: steps of the ramp that the device has been told, -1 without a ramp.
+"""Places in ``GuardState.words``. ``RAMP_DONE``: number of ramp steps that were sent, -1 without a ramp.
 ``N_SENT``: number of commands that were kept so far."""
 LONGEST_GAP_S, RAMP_STEP_NS, TIMES = range(3)
 """Places in ``GuardState.times``."""
@@ -77,8 +77,8 @@ def new_state(
 
 
 def admit(state: GuardState, wishes_V: Any, now_ns: int) -> int:
-    """Fill ``next_V`` from ``wishes_V``, one per channel. Return the mask of channels that were clipped or slew
-    limited, or a negative refusal; ``next_V`` is as it was then."""
+    """Fill ``next_V`` from ``wishes_V``, one per channel. Return a bit mask of the channels that were clipped or slew
+    limited, or a negative refusal, which leaves ``next_V`` as it was."""
     words = state.words
     if words[ARMED] == 0:
         return NOT_ARMED
@@ -145,7 +145,7 @@ def next_ramp_step(state: GuardState, now_ns: int) -> bool:
 
 
 def note_sent(state: GuardState, sent_ns: int) -> None:
-    """Note, and keep, that the device was told ``next_V`` at ``sent_ns``."""
+    """Note, and keep in the list of commands, that ``next_V`` was sent at ``sent_ns`` (bench clock)."""
     words = state.words
     for i in range(len(state.last_V)):
         state.last_V[i] = state.next_V[i]

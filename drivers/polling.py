@@ -1,4 +1,4 @@
-"""Compute how often the instrument's tasks use their devices, in whole ticks, from the rates of the bench file.
+"""Computes how often the instrument's tasks use their devices, in whole ticks, from the rates of the bench file.
 
 The firmware's task table and the load of the buses are both derived from this, so that they cannot differ.
 A rate that the ticks do not give is refused with the nearest rates that they do give.
@@ -23,7 +23,7 @@ from drivers.registry import find_driver
 from hal.bench import BenchDescription, I2cSpec
 
 LONGEST_FRAME = 1000
-"""Ticks: nothing is polled less often than once in so many."""
+"""Largest number of ticks between two polls of a device."""
 MOST_IN_FRAME = 4
 AXES = 3
 
@@ -39,7 +39,7 @@ SLOWER_MONITORS = (Polls(4), Polls(5), Polls(10), Polls(20))
 
 
 def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, list[str]]:
-    """The polls of the bench's devices, and a message for each rate that the ticks do not give."""
+    """Return the polls of the bench's devices, and a message for each rate that the ticks do not allow."""
     tick_hz = description.clock.tick_hz
     problems: list[str] = []
     magnetometer = monitor = None
@@ -80,12 +80,12 @@ def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tup
 
 
 def poll_divider(rate_hz: float, tick_hz: int) -> int:
-    """Ticks between two looks at a sensor that samples by its own clock: often enough to see every sample."""
+    """Return the ticks between two polls of a sensor that samples by its own clock, so that no sample is missed."""
     return max(1, int(tick_hz / rate_hz))
 
 
 def _ticks_of_conversion(description: BenchDescription, adc: str) -> int:
-    """Ticks from one poll of a converter to the next one that surely finds its conversion done."""
+    """Return the ticks from one poll of a converter to the next one that certainly finds its conversion done."""
     bus = description.bus.get(description.device[adc].bus or "")
     transfer_s = WIRE_BITS["reading"] / bus.speed_hz if isinstance(bus, I2cSpec) else 0.0
     conversion_s = WAKE_UP_NS * 1e-9 + (1.0 + RATE_TOLERANCE) / SAMPLES_PER_S
@@ -93,7 +93,8 @@ def _ticks_of_conversion(description: BenchDescription, adc: str) -> int:
 
 
 def _polls(rate_hz: float, each: int, tick_hz: int, gap: int, most: int = MOST_IN_FRAME) -> Polls | None:
-    """``each * rate_hz`` polls a second in the shortest frame, at least ``gap`` ticks apart; ``None``: impossible."""
+    """Return ``each * rate_hz`` polls per second in the shortest frame, at least ``gap`` ticks apart, or ``None`` if
+    that is impossible."""
     for count in range(1, most + 1):
         divider = tick_hz * count / (each * rate_hz)
         if not divider <= LONGEST_FRAME + 1:  # infinite, for a rate of next to nothing
@@ -107,7 +108,7 @@ def _polls(rate_hz: float, each: int, tick_hz: int, gap: int, most: int = MOST_I
 
 
 def _rates(each: int, tick_hz: int, gap: int, most: int) -> Iterator[float]:
-    """Rates that work and that a bench file can say in six digits."""
+    """Yield the rates (Hz) that are possible, in six digits as a bench file states them."""
     for divider in range(1, LONGEST_FRAME + 1):
         for count in range(1, most + 1):
             rate_hz = float(f"{tick_hz * count / divider / each:g}")

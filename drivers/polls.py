@@ -1,4 +1,4 @@
-"""Polls in whole ticks: what ``drivers.polling`` computes and drivers and tasks receive."""
+"""Describes polls in whole ticks, which ``drivers.polling`` computes and drivers and tasks receive."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Polls:
-    """``count`` polls, evenly spread, in every frame of ``divider`` ticks."""
+    """Describes ``count`` polls, evenly spread, in every frame of ``divider`` ticks."""
 
     divider: int
     count: int = 1
 
     def per_s(self, tick_hz: float) -> float:
+        """Return the number of polls per second."""
         return tick_hz * self.count / self.divider
 
     def ticks(self, first: int) -> tuple[int, ...]:
@@ -21,6 +22,7 @@ class Polls:
 
     @property
     def shortest_gap(self) -> int:
+        """Return the smallest number of ticks between two polls."""
         return self.divider // self.count
 
 

@@ -128,10 +128,10 @@ class Driver:
     ``probe`` and ``write_digital``; an "output", an ``AnalogOutput`` with ``probe``. Other roles are parts of the
     instruments' own loops. ``needs`` is the key that connects the device and is required. ``inputs(options)`` returns
     the inputs of its DAQ or ADC that it uses. ``traffic(load)`` returns what it repeats on its bus; a device whose
-    traffic no task waits for may give ``bits_per_s(options)`` instead, with 9 bits for an I2C byte and 10 for a serial
-    one. ``addresses`` lists the 7-bit I2C addresses that the pins of the part select; empty means that it has none.
-    ``max_bus_hz`` is the fastest I2C clock of the part, in Hz. ``leased`` is the class of an output (``DacOutput``)
-    that a guardian can hold as well. ``verifies`` is True for an output that can be read back.
+    traffic no task waits for may give ``bits_per_s(options)``, in bit/s, instead, with 9 bits for an I2C byte and 10
+    for a serial one. ``addresses`` lists the 7-bit I2C addresses that the pins of the part select; empty means that it
+    has none. ``max_bus_hz`` is the fastest I2C clock of the part, in Hz. ``leased`` is the class of an output
+    (``DacOutput``) that a guardian can drive as well. ``verifies`` is True for an output that can be read back.
     ``has_kernels`` is True for a device that a compiled loop can read or command.
     """
 
@@ -149,7 +149,7 @@ class Driver:
     has_kernels: bool = False
 
     def repeated(self, load: Load) -> Iterable[Traffic]:
-        """Return all that the driver repeats on its bus."""
+        """Return every transaction that the driver repeats on its bus."""
         if self.traffic is not None:
             return self.traffic(load)
         return (Traffic("in all", self.bits_per_s(load.options), 1.0),)

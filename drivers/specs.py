@@ -1,4 +1,4 @@
-"""Check each driver's entry in a bench file, and the arithmetic constraints that a bench must satisfy.
+"""Checks each driver's entry in a bench file, and the arithmetic constraints that a bench must satisfy.
 
 ``hal.bench`` has checked references and addresses; here the drivers' own keys, channel claims, rates and the
 time that each bus has per second are checked, so that an impossible bench is refused before it is opened.
@@ -19,7 +19,7 @@ from hal.validation import validate_table
 
 
 def device_options(description: BenchDescription, name: str, where: str) -> Any:
-    """The checked options of device ``name``. Raises ``BenchError`` naming file and key."""
+    """Return the checked options of device ``name``. Raises ``BenchError`` naming file and key."""
     spec = description.device[name]
     driver = REGISTRY.find(spec.driver)
     if driver is None:
@@ -36,7 +36,8 @@ def device_options(description: BenchDescription, name: str, where: str) -> Any:
 
 
 def check_devices(description: BenchDescription, where: str) -> dict[str, Any]:
-    """Options of every device by name, after all checks that need more than one of them."""
+    """Return the options of every device by name, after all checks that involve several devices. Raises ``BenchError``
+    with all problems."""
     options = {name: device_options(description, name, where) for name in description.device}
     problems = [
         *_channel_claims(description, options),

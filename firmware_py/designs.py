@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import AnyArray
 from hal.compiled import user_cache
 
-Array = NDArray[Any]
 
-
-def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
+def design(function: str, *arguments: Any, **options: Any) -> tuple[AnyArray, ...]:
     """Return what ``scipy.signal.FUNCTION`` returns, as a tuple of arrays. Arguments: numbers, strings, arrays."""
     plain = [_plain(argument) for argument in arguments], {name: _plain(value) for name, value in options.items()}
     asked = json.dumps([function, _scipy_version(), *plain], sort_keys=True)
@@ -34,7 +32,7 @@ def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
         return known
     found: Any = getattr(importlib.import_module("scipy.signal"), function)(*arguments, **options)
     parts = cast("tuple[Any, ...]", found) if isinstance(found, tuple) else (found,)
-    arrays: tuple[Array, ...] = tuple(np.asarray(part) for part in parts)
+    arrays: tuple[AnyArray, ...] = tuple(np.asarray(part) for part in parts)
     _write(file, asked, arrays)
     return arrays
 
@@ -54,7 +52,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _read(file: Path, asked: str) -> tuple[Array, ...] | None:
+def _read(file: Path, asked: str) -> tuple[AnyArray, ...] | None:
     try:
         table = json.loads(file.read_text())
         if table["asked"] != asked:
@@ -64,7 +62,7 @@ def _read(file: Path, asked: str) -> tuple[Array, ...] | None:
         return None
 
 
-def _array(part: dict[str, Any]) -> Array:
+def _array(part: dict[str, Any]) -> AnyArray:
     real = np.array(part["real"], dtype=np.float64).reshape(part["shape"])
     if part["imag"] is None:
         return real
@@ -73,7 +71,7 @@ def _array(part: dict[str, Any]) -> Array:
     return whole
 
 
-def _write(file: Path, asked: str, arrays: tuple[Array, ...]) -> None:
+def _write(file: Path, asked: str, arrays: tuple[AnyArray, ...]) -> None:
     parts = [
         {
             "shape": array.shape,

@@ -15,9 +15,7 @@ from typing import Any, Protocol, TypeVar, cast, get_args, get_origin, get_type_
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
-Integers = NDArray[np.int64]
+from hal.arrays import Array, ComplexArray, IntArray
 
 # a record, or the one-element record array around it, where the type is not declared
 Record = Any
@@ -48,7 +46,7 @@ class Declared:
 
 
 _SCALARS: tuple[tuple[Any, str, bool], ...] = (
-    (float, "f8", False), (int, "i8", False), (Array, "f8", True), (Integers, "i8", True), (Complexes, "c16", True),
+    (float, "f8", False), (int, "i8", False), (Array, "f8", True), (IntArray, "i8", True), (ComplexArray, "c16", True),
 )  # fmt: skip
 """Annotation, layout, and if the field is an array."""
 

@@ -10,13 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hal.arrays import Array, Int16Array
 from hal.types import CanFrame, CanStats, I2cOp, OutputLimit, PortInfo, ScanBlock, ScanConfig, ScanInfo
-
-Float64Array = NDArray[np.float64]
-Int16Array = NDArray[np.int16]
 
 
 class Clock(Protocol):
@@ -149,10 +144,12 @@ class AnalogOutput(Protocol):
         """Allow ``write``. Raises ``SafetyTrip`` when the self-test fails."""
         ...
 
-    def write(self, values_V: Float64Array) -> int:
-        """Output ``values_V`` (n_channels,) in V. Return a bit mask of the channels that were clipped or slew limited.
+    def write(self, values_V: Array) -> int:
+        """Output ``values_V`` (n_channels,) in V at the load.
 
-        Raises ``SafetyTrip`` before ``arm()`` and on a value that is not finite. Never raises for clipping.
+        Return a bit mask: bit i is set if channel i was clipped to its limits or slew limited, so 0 means that no
+        value was changed. Clipping is no error. Raises ``SafetyTrip`` before ``arm()`` and for a value that
+        is not finite; nothing is output then. Raises what the bus raises if the transfer fails.
         """
         ...
 
@@ -160,7 +157,7 @@ class AnalogOutput(Protocol):
         """Make one step of the ramp to ``safe_V``; return True once it is reached. Works armed or not, and disarms."""
         ...
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the outputs that the device itself reports (n_channels,), in V."""
         ...
 

@@ -80,7 +80,7 @@ class Ads1115:
     def probe(self) -> str:
         """Write the configuration (no conversion) and read it back: the part has no identity register.
 
-        Raises ``WrongDevice`` when another value comes back and ``I2cNack`` when nobody is there.
+        Raises ``WrongDevice`` if another value comes back and ``I2cNack`` if no device answers.
         """
         word = MUX_SINGLE_ENDED | self._config
         self._bus.transfer(self._address, [I2cWrite(bytes((POINTER_CONFIG, word >> 8, word & 0xFF)))])

@@ -19,7 +19,8 @@ import numpy as np
 
 from drivers.options import Di4108Options
 from drivers.registry import Driver, Site
-from hal.contracts import Clock, Int16Array, SerialPort
+from hal.arrays import Int16Array
+from hal.contracts import Clock, SerialPort
 from hal.errors import (
     BenchError,
     ErrorKind,
@@ -69,7 +70,7 @@ def packet_code(rate_hz: float, width: int) -> int:
 
 
 class Di4108:
-    """AnalogInputScan and two switch outputs on a serial port.
+    """Implements ``AnalogInputScan``, and two switch outputs, on a serial port.
 
     ``configure`` -> ``start`` -> ``read_scans`` ... -> ``stop``. One command is under way at a time and every
     echo is verified within ``answer_timeout_s``.
@@ -100,9 +101,9 @@ class Di4108:
     # identity and configuration
 
     def probe(self) -> str:
-        """Stop whatever runs, ask who is there; returns "DI-4108 firmware 1.01 serial ...".
+        """Stop a scan, and return the identity: "DI-4108 firmware 1.01 serial ...".
 
-        Raises ``WrongDevice`` for another model and ``HalTimeout`` when nobody answers.
+        Raises ``WrongDevice`` for another model and ``HalTimeout`` without an answer.
         """
         self.stop()
         model = self._ask("info 1")
@@ -117,7 +118,7 @@ class Di4108:
         return f"DI-{MODEL} firmware {self.firmware} serial {self.serial_number}"
 
     def configure(self, config: ScanConfig) -> ScanInfo:
-        """Set scan list, ranges, rate and packet size. ``BenchError`` when the device cannot do it."""
+        """Set scan list, ranges, rate and packet size. Raises ``BenchError`` if the device cannot do that."""
         channels = config.channels
         if not channels or len(set(channels)) != len(channels) or not all(0 <= c <= 7 for c in channels):
             raise BenchError(
@@ -157,7 +158,7 @@ class Di4108:
         return self._info
 
     def _load_kernels(self, width: int, packet_bytes: int, rate_hz: float) -> None:
-        """Compile or load the kernels and make their state: no read may wait for that."""
+        """Compile or load the kernels and create their state, so that no read waits for that."""
         from drivers.daq import di4108_kernels
 
         self._kernels = di4108_kernels
@@ -187,8 +188,8 @@ class Di4108:
     def read_scans(self, out: Int16Array, timeout_s: float) -> ScanBlock:
         """See ``AnalogInputScan.read_scans``. ``seq0`` counts device scans from ``start``, lost ones included.
 
-        Raises ``Overrun`` when the device reported a FIFO overflow and ``ProtocolError`` (framing) when bytes
-        are missing: both end the scan, ``start`` begins a new one.
+        Raises ``Overrun`` if the device reported a FIFO overflow and ``ProtocolError`` (framing) if bytes are missing.
+        Both end the scan, and ``start`` begins a new one.
         """
         if out.shape[1] != self._width:
             raise BenchError(f"room for {out.shape[1]} channels, {self._width} are scanned", device=self.name)
@@ -197,7 +198,7 @@ class Di4108:
         return self.block_of(*kernels.decode(stream, self._bytes, out))
 
     def block_of(self, n: int, t0_ns: int, seq0: int, lost: int, shifted: bool) -> ScanBlock:
-        """Return what ``decode`` has just found as ``read_scans`` does; a compiled loop hands over scans with it."""
+        """Return the results of ``decode`` as ``read_scans`` does; a compiled loop hands scans over by it."""
         stream = self._stream
         if n == 0:
             if stream["overflowed"][0]:
@@ -229,7 +230,7 @@ class Di4108:
         self.obey(verdict)
 
     def obey(self, verdict: int) -> None:
-        """Do what the ``verdict`` of ``accept`` asks for. Raises ``ProtocolError`` when bytes are missing."""
+        """Handle the ``verdict`` of ``accept``. Raises ``ProtocolError`` if bytes are missing."""
         kernels, stream = self._kernels, self._stream
         if verdict == kernels.OVERFLOWED:
             self._scanning = False
@@ -265,7 +266,7 @@ class Di4108:
         )
 
     def stop(self) -> None:
-        """End the scan and throw away what is still on its way. Bounded; also right when nothing runs."""
+        """End the scan and discard what is still arriving, within a time limit. May be called without a scan."""
         self.port.write(b"stop\r", self._answer_timeout_s)
         limit_ns = self._clock.now_ns() + round(self._answer_timeout_s * 1e9)
         tail = b""
@@ -295,7 +296,7 @@ class Di4108:
     # switch outputs
 
     def write_digital(self, bits: int) -> None:
-        """Set switch outputs 0 and 1 (bit 0 and 1). While scanning the device does not echo, so nor do we wait."""
+        """Set switch outputs 0 and 1 (bit 0 and 1). During a scan the device does not echo, so this does not wait."""
         if not 0 <= bits <= 3:
             raise BenchError(f"digital outputs {bits:#x}: only bits 0 and 1 are outputs", device=self.name)
         self._digital_bits = bits
@@ -340,7 +341,7 @@ class Di4108:
 
 
 def _clean(line: bytes) -> str:
-    """The manual allows LF and stray NULs between echoes."""
+    """Return the text of an echo without LF and NULs, which the manual allows between echoes."""
     return line.replace(b"\x00", b"").replace(b"\n", b"").decode("latin-1").strip("\r")
 
 

@@ -1,11 +1,12 @@
-"""A DAQ that sends its scans one by one with a sequence number: blocks, holes and times, the same for all of them."""
+"""Implements blocks, gaps and times for a DAQ that sends its scans one by one with a sequence number."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from hal.contracts import Clock, Int16Array, SerialPort
+from hal.arrays import Int16Array
+from hal.contracts import Clock, SerialPort
 from hal.scan_time import ScanTimeline
 from hal.types import ScanBlock, ScanConfig, ScanInfo, Status, TimeSource
 
@@ -33,7 +34,7 @@ class ScanByScan(ABC):
 
     @abstractmethod
     def next_scan(self, timeout_s: float) -> tuple[int, Sequence[int]] | None:
-        """Sequence number and counts of the next scan, ``None`` after ``timeout_s``."""
+        """Return sequence number and counts of the next scan, or ``None`` after ``timeout_s``."""
 
     @abstractmethod
     def stop(self) -> None: ...
@@ -73,7 +74,7 @@ class ScanByScan(ABC):
             if scan is None:
                 break
             gap = (scan[0] - self._next) % self.modulo
-            if gap and n:  # a block has no hole: the rest comes with the next one
+            if gap and n:  # a block has no gap: the rest comes with the next one
                 self._kept = scan
                 break
             out[n] = scan[1]

@@ -1,4 +1,4 @@
-"""The CAN frames of the bench, read from ``micron.dbc`` with cantools.
+"""Reads the CAN frames of the bench from ``micron.dbc`` with cantools.
 
 What lives here: the frame table and its loading. What must not: what a frame makes a driver do (``drivers.piezo``,
 ``drivers.can_telemetry``); the emulated nodes read the manual, not this file.
@@ -13,7 +13,7 @@ from hal.backends.can_package import import_can
 
 
 class DbcMessage(Protocol):
-    """The part of a cantools message that the drivers use."""
+    """Defines the part of a cantools message that the drivers use."""
 
     frame_id: int
     length: int

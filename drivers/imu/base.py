@@ -1,7 +1,7 @@
-"""The common interface of all inertial sensors of the bench, whatever chip they are.
+"""Defines the interface of all inertial sensors of the bench.
 
 Units are SI: m/s^2 (specific force, +g on an axis that points up), rad/s (right-hand rule), degC, T. Ranges are
-chosen by the data sheets' names (2 g, 250 deg/s), because a chip has a handful of them and no others.
+chosen by the data sheets' names (2 g, 250 deg/s), because a chip has only these.
 """
 
 from __future__ import annotations
@@ -13,20 +13,19 @@ from enum import Enum
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.contracts import Float64Array
+from hal.arrays import Array, Int32Array
 from hal.errors import BenchError
 from hal.scan_time import ScanTimeline
 from hal.types import STANDARD_GRAVITY, ChannelInfo, Status, TimeSource
 
 RAD_PER_DEG = math.pi / 180.0
 AXES = ("x", "y", "z")
-LATE = 0.02  # periods; a read this much short of two periods after the last one has still missed a sample
+LATE = 0.02
+"""Fraction of a period. A read that comes by less than this before the end of the second period has missed a sample."""
 
 Mode = Literal["data ready", "fifo"]
 Triple = tuple[float, float, float]
-Int32Array = NDArray[np.int32]
 
 
 class PowerMode(Enum):
@@ -62,9 +61,9 @@ class ImuSample:
     ``Status.STALE`` repeats the last one: its ``t_ns`` and ``seq`` too. ``field_T`` is NaN without magnetometer.
     """
 
-    accel_mps2: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
-    gyro_rad_s: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
-    field_T: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
+    accel_mps2: Array = field(default_factory=lambda: np.full(3, np.nan))
+    gyro_rad_s: Array = field(default_factory=lambda: np.full(3, np.nan))
+    field_T: Array = field(default_factory=lambda: np.full(3, np.nan))
     temperature_C: float = math.nan
     raw: Int32Array = field(default_factory=lambda: np.zeros(7, np.int32))
     t_ns: int = 0
@@ -78,8 +77,8 @@ class ImuBlock:
     """Holds the samples of one FIFO read: ``n`` rows, oldest first, taken ``dt_ns`` apart from ``t0_ns`` on."""
 
     def __init__(self, capacity: int = 512) -> None:
-        self.accel_mps2: Float64Array = np.full((capacity, 3), np.nan)
-        self.gyro_rad_s: Float64Array = np.full((capacity, 3), np.nan)
+        self.accel_mps2: Array = np.full((capacity, 3), np.nan)
+        self.gyro_rad_s: Array = np.full((capacity, 3), np.nan)
         self.raw: Int32Array = np.zeros((capacity, 6), np.int32)
         self.temperature_C = math.nan
         self.capacity = capacity
@@ -145,36 +144,41 @@ class Imu(Protocol):
         ...
 
     def reset(self, limit_s: float = 0.1) -> None:
-        """Back to the data sheet's reset state; ``HalTimeout`` after ``limit_s``."""
+        """Set the chip to the data sheet's reset state. Raises ``HalTimeout`` after ``limit_s``."""
         ...
 
     def configure(
         self, *, rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None = None
     ) -> ImuSetup:
-        """Ranges must be the chip's own; rate: the chip's lowest that is not below; bandwidth: its highest that
-        is not above (``None``: half the rate). The answer is what the chip does. ``BenchError`` otherwise."""
+        """Set rate, ranges and bandwidth, and return the settings that the chip uses.
+
+        The rate is the chip's lowest that is not below ``rate_hz``, the bandwidth its highest that is not above
+        ``bandwidth_hz`` (``None``: half the rate). Raises ``BenchError`` for a range that the chip does not have."""
         ...
 
     def start(self, mode: Mode = "data ready", limit_s: float = 0.5) -> None:
-        """Begin to measure and wait for the first sample; ``HalTimeout`` after ``limit_s``."""
+        """Begin to measure and wait for the first sample. Raises ``HalTimeout`` after ``limit_s``."""
         ...
 
     def read(self, out: ImuSample) -> Status:
-        """The newest sample, all of one instant. Never waits. Needs mode "data ready"."""
+        """Read the newest sample, all of one instant, into ``out``, and return its status: ``STALE`` if it is not new.
+        Never waits. Needs mode "data ready"."""
         ...
 
     def read_fifo(self, out: ImuBlock) -> int:
-        """Everything that the FIFO holds, as far as ``out`` has room; returns ``out.n``. Needs mode "fifo"."""
+        """Read the FIFO as far as ``out`` has room, and return ``out.n``. Needs mode "fifo"."""
         ...
 
     def read_offsets(self) -> ImuOffsets: ...
 
     def write_offsets(self, offsets: ImuOffsets) -> ImuOffsets:
-        """Write and read back; the answer is what the chip keeps (its own steps). ``BenchError`` out of range."""
+        """Write the offsets, and return those that the chip keeps, in its own steps. Raises ``BenchError`` for an
+        offset out of range."""
         ...
 
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
-        """The data sheet's own; the instrument must rest. Ends configured and started as before."""
+        """Run the data sheet's self-test, with the instrument at rest. The chip is configured and started as before at
+        the end."""
         ...
 
     def power(self, mode: PowerMode) -> None: ...
@@ -182,14 +186,14 @@ class Imu(Protocol):
 
 
 def pick_range(value: float, codes: dict[float, int], what: str, name: str) -> int:
-    """Return the chip's code of a range. ``BenchError`` lists the ranges of the chip."""
+    """Return the chip's code of a range. Raises ``BenchError``, which lists the ranges of the chip."""
     if value not in codes:
         raise BenchError(f"{what} = {value:g} is not one of {', '.join(f'{v:g}' for v in sorted(codes))}", device=name)
     return codes[value]
 
 
 def pick_rate(rate_hz: float, codes: dict[float, int], name: str) -> tuple[float, int]:
-    """The lowest rate of the chip that is not below ``rate_hz``, and its code."""
+    """Return the lowest rate of the chip that is not below ``rate_hz``, and its code."""
     good = [rate for rate in sorted(codes) if rate >= rate_hz * 0.999]
     if not good or rate_hz <= 0:
         raise BenchError(f"rate_hz = {rate_hz:g} is outside 0 .. {max(codes):g} Hz", device=name)
@@ -197,14 +201,14 @@ def pick_rate(rate_hz: float, codes: dict[float, int], name: str) -> tuple[float
 
 
 def pick_bandwidth(bandwidth_hz: float, codes: dict[float, int]) -> tuple[float, int]:
-    """The highest bandwidth of the chip that is not above ``bandwidth_hz`` (or its lowest), and its code."""
+    """Return the highest bandwidth of the chip that is not above ``bandwidth_hz`` (or its lowest), and its code."""
     good = [b for b in sorted(codes) if b <= bandwidth_hz] or [min(codes)]
     return good[-1], codes[good[-1]]
 
 
 class SampleCounter:
-    """Sequence and losses where the chip only says "new" or "not new": a chip with period T that is asked again
-    after t has made at least floor(t/T) samples, of which one was read."""
+    """Counts samples and losses of a chip that only reports "new" or "not new": a chip of period T that is read again
+    after t has taken at least floor(t/T) samples, of which one was read."""
 
     def __init__(self) -> None:
         self.restart(1)
@@ -217,7 +221,7 @@ class SampleCounter:
         self._period_ns = period_ns
 
     def fresh(self, t_ns: int) -> int:
-        """A new sample at ``t_ns``: returns how many were surely lost before it."""
+        """Count a new sample at ``t_ns`` (bench clock), and return the number that were certainly lost before it."""
         lost = 0
         if self.seq >= 0:
             lost = max(0, math.floor((t_ns - self.t_ns) / self._period_ns + LATE) - 1)
@@ -227,7 +231,8 @@ class SampleCounter:
         return lost
 
     def count(self, out: ImuSample, new: bool, t_ns: int) -> Status:
-        """Head of ``out`` for what was read at ``t_ns``; ``STALE``, and the last time again, when it was not new."""
+        """Fill time, number and loss of ``out`` for a reading at ``t_ns``, and return its status. A reading that is not
+        ``new`` is ``STALE`` and keeps the last time and number."""
         if new:
             out.lost = self.fresh(t_ns)
             status = Status.OVERRUN if out.lost else Status.OK
@@ -242,7 +247,7 @@ class SampleCounter:
 
 
 class FifoTimeline:
-    """Times, numbers and losses of FIFO frames; ``period_ns`` apart as far as the chip's clock is good."""
+    """Stamps FIFO frames, which are ``period_ns`` apart by the chip's clock, with bench time, number and losses."""
 
     def __init__(self) -> None:
         self._forget(1)
@@ -261,10 +266,10 @@ class FifoTimeline:
         self._left = 0
 
     def stamp(self, out: ImuBlock, n: int, arrival_ns: int, overrun: bool, left: int = 0) -> None:
-        """Fill the head of ``out`` for ``n`` frames read at ``arrival_ns``; ``overrun``: older ones are gone.
+        """Fill times, numbers and losses of ``out`` for ``n`` frames read at ``arrival_ns`` (bench clock).
 
-        ``left`` newer frames stayed in the FIFO for want of room. How many are gone the chips do not say; the
-        time since the last emptying does, within one frame."""
+        ``overrun``: older frames were lost. ``left`` newer frames stayed in the FIFO for want of room. The chips do not
+        report how many frames were lost; the time since the last read gives the number within one frame."""
         lost = 0
         if overrun:
             elapsed = (arrival_ns - self._last_ns) / self.period_ns if self._last_ns >= 0 else 0.0
@@ -299,7 +304,7 @@ def imu_channels(
 
 
 def offset_counts(wanted: Triple, step: float, lowest: int, highest: int, what: str, name: str) -> list[int]:
-    """Offsets in register steps. ``BenchError`` when one does not fit."""
+    """Return the offsets in register steps. Raises ``BenchError`` if one does not fit."""
     counts = [round(value / step) for value in wanted]
     for axis, count in zip(AXES, counts, strict=True):
         if not lowest <= count <= highest:
@@ -311,13 +316,13 @@ def offset_counts(wanted: Triple, step: float, lowest: int, highest: int, what: 
 
 
 def require_mode(mode: Mode | None, wanted: Mode, name: str) -> None:
-    """``BenchError`` unless the sensor was started in ``wanted``."""
+    """Raise ``BenchError`` unless the sensor was started in mode ``wanted``."""
     if mode != wanted:
         raise BenchError(f"started in mode {mode!r}; this call needs start(mode={wanted!r})", device=name)
 
 
 class CountingImu:
-    """``lost`` and ``stale`` since ``start`` of a chip that is either asked for each sample or empties its FIFO."""
+    """Counts ``lost`` and ``stale`` samples since ``start`` of a chip that is read sample by sample or by its FIFO."""
 
     def __init__(self) -> None:
         self._counter = SampleCounter()

@@ -94,7 +94,7 @@ def make_imu(spec: DeviceSpec, options: ImuOptions, bus: I2cBus, clock: Clock, n
 
 
 def open_imu(spec: DeviceSpec, options: ImuOptions, bus: I2cBus, clock: Clock, name: str) -> Imu:
-    """``make_imu``, then probe, reset and configure as the bench says; ``start`` is left to the caller."""
+    """Make, probe, reset and configure the sensor of a bench entry. The caller calls ``start``."""
     imu = make_imu(spec, options, bus, clock, name)
     imu.probe()
     imu.reset()
@@ -108,7 +108,8 @@ def open_imu(spec: DeviceSpec, options: ImuOptions, bus: I2cBus, clock: Clock, n
 
 
 def address_problems(description: BenchDescription, options: dict[str, Any]) -> list[str]:
-    """Addresses that two parts claim on one bus, with the strap that frees one; and impossible addresses."""
+    """Return a message for each address that two parts claim on one bus, with the strap that changes one, and for each
+    impossible address."""
     claims: dict[tuple[str, int], list[tuple[str, str]]] = defaultdict(list)
     problems: list[str] = []
     for name, spec in description.device.items():
@@ -191,7 +192,7 @@ def transactions(option: ImuOptions, name: str) -> list[tuple[str, int, float]]:
 
 
 def _bits(n: int) -> int:
-    """Bits of reading ``n`` bytes from a register on."""
+    """Return the bits on the wire of reading ``n`` bytes, starting at a register."""
     return i2c_bits((I2cWrite(bytes(1)), I2cRead(n)))
 
 

@@ -24,7 +24,6 @@ from drivers.imu.base import (
     ImuOffsets,
     ImuSample,
     ImuSetup,
-    Int32Array,
     Mode,
     PowerMode,
     SelfTestReport,
@@ -38,6 +37,7 @@ from drivers.imu.base import (
 from drivers.imu.bmx055_addresses import check_addresses
 from drivers.imu.bmx055_mag import TRIM_BYTES, MagTrim, counts
 from drivers.imu.registers import Register, RegisterFile, join, signed
+from hal.arrays import Int32Array
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, HalTimeout
 from hal.types import ChannelInfo, Status, TimeSource

@@ -73,7 +73,7 @@ class Lsm6ds3(CountingImu):
         return f"LSM6DS3 at 0x{self._chip.address:02X}"
 
     def reset(self, limit_s: float = 0.1) -> None:
-        """Software reset; its bit clears when done (50 us typical). Block data update is switched on again."""
+        """Reset by software; the bit clears when done (50 us typical). Offsets are set to zero."""
         self._mode = None
         self._configured = False
         self._chip.write(m.CTRL3_C, join((m.IF_INC, 1), (m.SW_RESET, 1)))
@@ -134,7 +134,8 @@ class Lsm6ds3(CountingImu):
         return status
 
     def read_fifo(self, out: ImuBlock) -> int:
-        """FIFO_STATUS3/4 say which word of the pattern comes next: a begun frame is thrown away first."""
+        """Read all frames of the FIFO. FIFO_STATUS3/4 state which word of the pattern comes next; an incomplete frame
+        is discarded first."""
         require_mode(self._mode, "fifo", self.name)
         arrival_ns = self._clock.now_ns()
         s1, s2, s3, s4 = self._chip.read_block(m.FIFO_STATUS1, 4)
@@ -167,14 +168,15 @@ class Lsm6ds3(CountingImu):
         return self._offsets
 
     def write_offsets(self, offsets: ImuOffsets) -> ImuOffsets:
-        """Kept by this object (the chip has no registers for them), exactly as given."""
+        """Keep the offsets in this object, exactly as given, because the chip has no registers for them."""
         self._offsets = offsets
         self._accel_offset[:] = offsets.accel_mps2
         self._gyro_offset[:] = offsets.gyro_rad_s
         return offsets
 
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
-        """AN4650, self-test: accelerometer at 2 g and 52 Hz, gyro at 2000 deg/s and 208 Hz, positive direction."""
+        """Run the self-test of AN4650: accelerometer at 2 g and 52 Hz, gyro at 2000 deg/s and 208 Hz, positive
+        direction."""
         mode = self._mode
         if not self._configured:
             raise BenchError("self-test before configure", device=self.name)
@@ -223,7 +225,7 @@ class Lsm6ds3(CountingImu):
         return imu_channels(self.name, self.setup, (-40.0, 85.0, 1.0 / 16.0))
 
     def _mean(self, fresh: Field, limit_s: float) -> list[float]:
-        """Mean counts (gyro, accelerometer) of five samples after one that is thrown away."""
+        """Return the mean counts (gyro, accelerometer) of five samples after one that is discarded."""
         sums = [0] * 6
         for i in range(SELF_TEST_SAMPLES + 1):
             self._chip.await_field(fresh, 1, limit_s, "a sample of the self-test")

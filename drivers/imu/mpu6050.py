@@ -72,7 +72,7 @@ class Mpu6050(CountingImu):
         return f"MPU-6050 at 0x{self._chip.address:02X}"
 
     def reset(self, limit_s: float = 0.1) -> None:
-        """Device reset (4.28); it clears its bit when done. The factory's accelerometer trim is read and kept."""
+        """Reset the device (4.28), which clears its bit when done. Read and keep the factory's accelerometer trim."""
         self._mode = None
         self._configured = False
         self._chip.write(m.PWR_MGMT_1, join((m.DEVICE_RESET, 1)))
@@ -164,8 +164,8 @@ class Mpu6050(CountingImu):
         return ImuOffsets((accel[0], accel[1], accel[2]), (gyro[0], gyro[1], gyro[2]))
 
     def write_offsets(self, offsets: ImuOffsets) -> ImuOffsets:
-        """Accelerometer offsets go on top of the factory's trim in steps of 2 counts: bit 0 of each word belongs
-        to the temperature compensation and is kept."""
+        """Write the offsets. Those of the accelerometer are added to the factory's trim in steps of 2 counts, because
+        bit 0 of each word belongs to the temperature compensation. Needs ``reset`` before."""
         factory = self._trim()
         step = 2.0 * STANDARD_GRAVITY / OFFSET_LSB_PER_G
         steps = offset_counts(offsets.accel_mps2, step, -16384, 16383, "accelerometer", self.name)
@@ -180,7 +180,7 @@ class Mpu6050(CountingImu):
         return self.read_offsets()
 
     def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
-        """Reaction to the built-in force against the factory's record of it (RM 4.1): 8 g, 250 deg/s."""
+        """Compare the reaction to the built-in force with the factory's record of it (RM 4.1), at 8 g and 250 deg/s."""
         mode = self._mode
         if not self._configured:
             raise BenchError("self-test before configure", device=self.name)
@@ -249,7 +249,7 @@ class Mpu6050(CountingImu):
         return self._factory
 
     def _mean(self, limit_ns: int) -> list[float]:
-        """Mean counts of accelerometer and gyro over 20 samples, 0.2 s after a change of the settings."""
+        """Return the mean counts of accelerometer and gyro over 20 samples, 0.2 s after a change of the settings."""
         wait_s(self._clock, 0.2)
         sums = [0] * 6
         for _ in range(SELF_TEST_SAMPLES):
@@ -267,7 +267,7 @@ def celsius(raw: int) -> float:
 
 
 def factory_trim(registers: bytes) -> list[float]:
-    """Counts that the self-test should make, from ``SELF_TEST_X`` .. ``SELF_TEST_A`` (RM 4.1, p. 10, 11).
+    """Return the counts that the self-test should cause, from ``SELF_TEST_X`` .. ``SELF_TEST_A`` (RM 4.1, p. 10, 11).
 
     Accelerometer x, y, z at 8 g, then gyro x, y, z at 250 deg/s; 0 where the factory has left no record.
     """

@@ -1,7 +1,6 @@
-"""Registers of a chip as declarations: address, bits, reset value, access and where the data sheet says so.
+"""Declares the registers of a chip (address, bits, reset value, access, source), and accesses them over I2C.
 
-A driver then reads and writes names. Chips differ in their maps, not in how a register is reached over I2C:
-one byte of register address, then data, the address counting up by itself.
+Chips differ in their maps, not in the access: one byte of register address, then data, with the address counting up.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ class Register:
     source: str
 
     def bits(self, high: int, low: int | None = None) -> Field:
-        """The field of bits ``high`` down to ``low`` (one bit without ``low``), as data sheets write them."""
+        """Return the field of bits ``high`` down to ``low`` (one bit without ``low``), as data sheets write them."""
         low = high if low is None else low
         return Field(self, low, high - low + 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """Some neighbouring bits of a register."""
+    """Describes ``width`` neighbouring bits of a register, from bit ``low`` on."""
 
     register: Register
     low: int
@@ -47,13 +46,13 @@ class Field:
         return ((1 << self.width) - 1) << self.low
 
     def place(self, value: int) -> int:
-        """``value`` shifted to where it belongs. ``ValueError`` when it does not fit."""
+        """Return ``value`` shifted to the field's place. Raises ``ValueError`` if it does not fit."""
         if not 0 <= value < 1 << self.width:
             raise ValueError(f"{value} does not fit into {self.width} bit of {self.register.name}")
         return value << self.low
 
     def take(self, byte: int) -> int:
-        """The field's value in a byte read from its register."""
+        """Return the field's value in a byte that was read from its register."""
         return (byte & self.mask) >> self.low
 
     def replace(self, byte: int, value: int) -> int:
@@ -70,7 +69,7 @@ def join(*parts: tuple[Field, int]) -> int:
 
 
 class RegisterFile:
-    """The registers of one chip at one address. ``name`` is the bench entry, for errors."""
+    """Accesses the registers of one chip at one address. ``name`` is the bench entry, for errors."""
 
     def __init__(self, bus: I2cBus, clock: Clock, address: int, name: str) -> None:
         self.address = address
@@ -82,7 +81,7 @@ class RegisterFile:
         return self.read_block(register, 1)[0]
 
     def read_block(self, first: Register, n: int) -> bytes:
-        """``n`` bytes from ``first`` on in one transfer."""
+        """Read ``n`` bytes from ``first`` on, in one transfer."""
         return self._bus.transfer(self.address, [I2cWrite(bytes((first.address,))), I2cRead(n)])
 
     def burst(self, first: Register, n: int) -> Callable[[], bytes]:
@@ -98,7 +97,7 @@ class RegisterFile:
         self._bus.transfer(self.address, [I2cWrite(bytes((register.address, *values)))])
 
     def write_checked(self, register: Register, *values: int) -> None:
-        """``write``, then read back. ``ProtocolError`` when something else comes back."""
+        """Write as ``write`` does, and read back. Raises ``ProtocolError`` if something else comes back."""
         self.write(register, *values)
         read_back = self.read_block(register, len(values))
         if read_back != bytes(values):
@@ -115,7 +114,7 @@ class RegisterFile:
         return byte
 
     def update_checked(self, field: Field, value: int) -> None:
-        """``update``, then read the field back: reserved bits of the register may read as they like."""
+        """Update the field, and read it back; reserved bits are not compared. Raises ``ProtocolError``."""
         self.update(field, value)
         read_back = field.take(self.read(field.register))
         if read_back != value:
@@ -136,9 +135,9 @@ class RegisterFile:
             )
 
     def await_field(self, field: Field, value: int, limit_s: float, what: str, step_s: float = 0.001) -> None:
-        """Poll ``field`` every ``step_s`` until it is ``value``. ``HalTimeout`` after ``limit_s``.
+        """Poll ``field`` every ``step_s`` until it is ``value``. Raises ``HalTimeout`` after ``limit_s``.
 
-        A chip in the middle of its reset may not acknowledge: that is "not yet", too.
+        A chip that does not acknowledge, as during its reset, is polled on.
         """
         limit_ns = self._clock.now_ns() + round(limit_s * 1e9)
         while not self._is(field, value):

@@ -1,4 +1,4 @@
-"""Piezo amplifier as a CAN node: one setpoint frame per tick, status at 100 Hz (``drivers/dbc/micron.dbc``).
+"""Drives a piezo amplifier that is a CAN node: one set point frame per tick, status at 100 Hz (``dbc/micron.dbc``).
 
 The node itself ramps to its safe state on COMMAND safe and when the host's heartbeat stops; ``safe_step`` asks
 for it and waits, tick by tick, until a status frame confirms.
@@ -42,7 +42,8 @@ from drivers.piezo.can_node import (
     note_setpoint,
 )
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import CanBus, Clock, Float64Array
+from hal.arrays import Array
+from hal.contracts import CanBus, Clock
 from hal.errors import BenchError, HalError, HalTimeout, ProtocolError, SafetyTrip
 from hal.types import CanFrame, ChannelInfo, OutputLimit
 from hal.wire_bits import can_bits
@@ -96,13 +97,13 @@ class CanAmplifier(GuardedOutput):
         return self.node.words[STATE]
 
     @property
-    def measured_V(self) -> Float64Array:
+    def measured_V(self) -> Array:
         """Return the voltages (3,) in V that the node has measured, not a number before its first STATUS."""
         return np.array(self.node.measured_V)
 
     @property
     def is_ready(self) -> bool:
-        """True while nothing is odd: a compiled loop may command the node."""
+        """True if a compiled loop may command the node: it is armed, and no failure is pending."""
         return self.guard.armed and self.pending is None
 
     def probe(self, timeout_s: float = 0.5) -> str:
@@ -111,7 +112,7 @@ class CanAmplifier(GuardedOutput):
         return f"CAN piezo node, {STATE_NAMES[self.state]}"
 
     def poll(self) -> None:
-        """Take what has arrived; send our heartbeat when it is due."""
+        """Process the frames that have arrived, and send the host's heartbeat if it is due."""
         self.heartbeat.beat()
         for _ in range(RECEIVE_LIMIT):
             frame = self.bus.recv(0.0)
@@ -120,7 +121,7 @@ class CanAmplifier(GuardedOutput):
             self._take(frame)
 
     def forget_received(self) -> None:
-        """Pass over what has come: a compiled loop has received it, too."""
+        """Discard the frames that have arrived, because a compiled loop has received them, too."""
         while self.bus.recv(0.0) is not None:
             pass
 
@@ -159,9 +160,10 @@ class CanAmplifier(GuardedOutput):
         self.pending = None
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
-        """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Raises also when the node is not armed or is
-        silent."""
+    def write(self, values_V: Array) -> int:
+        """Write ``values_V`` (3,) and return the mask, both as ``AnalogOutput.write`` says. Raises ``SafetyTrip`` if
+        the node has left the armed state, ``HalTimeout`` if it is silent, ``ProtocolError`` if it accepts no set
+        point."""
         if self.pending is not None:
             raise self._take_pending()
         self.poll()
@@ -172,7 +174,7 @@ class CanAmplifier(GuardedOutput):
         return mask
 
     def safe_step(self) -> bool:
-        """Ask for the safe state, again every 5 ticks; True once the node says that it is disarmed.
+        """Request the safe state, again every 5 calls. Return True once the node reports that it is disarmed.
 
         Raises ``HalTimeout`` when it does not confirm within 100 ticks (the node's own watchdog then acts).
         """
@@ -190,7 +192,7 @@ class CanAmplifier(GuardedOutput):
             )
         return False
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the voltages (3,) in V that the node measured, from its next status frame. It holds the set point
         meanwhile."""
         if not self.guard.armed:
@@ -246,7 +248,7 @@ class CanAmplifier(GuardedOutput):
         return (words[ACKNOWLEDGED] - counter) & 0xFF <= (words[COUNTER] - 1 - counter) & 0xFF
 
     def _hold(self) -> None:
-        """An armed node wants setpoints all the time: its own watchdog may be as short as 10 ms."""
+        """Repeat the set point, because the watchdog of an armed node may be as short as 10 ms."""
         self._send_setpoint()
         self.poll()
 

@@ -1,4 +1,4 @@
-"""The CAN node's frames and its link, as functions that run in the interpreter and, over the same memory, compiled.
+"""Encodes and decodes the CAN node's frames and judges its link, in the interpreter and compiled, on the same memory.
 
 They read no clock, raise nothing and import no numba. Data bytes of a frame are ``bytes`` in the interpreter and an
 array in compiled code. A compiled loop gives the functions to ``hal.compiled.kernel``.
@@ -24,11 +24,11 @@ COUNTER_LAG_LIMIT = 64
 COMMAND_EVERY = 5
 """Ticks of a ramp from one COMMAND to the next."""
 RECEIVE_LIMIT = 32
-"""Frames per tick, so that a babbling bus cannot hold it."""
+"""Largest number of frames received per tick, so that a flooded bus cannot delay it."""
 
 STATE, COUNTER, ACKNOWLEDGED, STATUS_NS, SAFE_STEPS, ASKED_NS, WORDS = range(7)
 """Places in ``NodeMemory.words``: the node's state, the counter of the next set point, the last one that a STATUS has
-acknowledged, when that came, steps since the safe state was asked for, and when that was."""
+acknowledged, the bench time of that (ns), steps since the safe state was requested, and the bench time of that."""
 WELL, SILENT, LEFT, LAGS = range(4)
 """The answers of ``link_fault``: nothing, no STATUS, a node that is not armed, set points that are not accepted."""
 
@@ -86,7 +86,7 @@ def encode_setpoint(node: NodeMemory, values_V: Any) -> None:
 
 
 def note_setpoint(node: NodeMemory) -> None:
-    """The bus has taken ``setpoint``."""
+    """Note that the bus has taken ``setpoint``."""
     node.words[COUNTER] = (node.words[COUNTER] + 1) & 0xFF
 
 
@@ -130,7 +130,7 @@ def must_ask(node: NodeMemory, now_ns: int) -> bool:
 
 
 def is_safe(node: NodeMemory) -> bool:
-    """Return True, and begin anew, once the node says that it is disarmed: its outputs are at the safe state."""
+    """Return True once the node reports that it is disarmed, with its outputs at the safe state; then count anew."""
     words = node.words
     if words[STATE] != DISARMED or words[STATUS_NS] <= words[ASKED_NS]:
         return False

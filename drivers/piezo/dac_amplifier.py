@@ -5,7 +5,6 @@ Source: Analog Devices AD5696R data sheet rev. B: "Input shift register" (Tables
 
 One transfer per update: A, B, C into the input registers, then one update command, so that all outputs move at
 once. Segments are separated by repeated STARTs, because the data sheet knows one 24-bit word per address byte.
-The DAC has no watchdog: the safe state is the firmware's duty.
 """
 
 from __future__ import annotations
@@ -81,9 +80,8 @@ class DacAmplifier(DacOutput):
         return [int.from_bytes(answer[2 * i : 2 * i + 2], "big") for i in range(CHANNELS)]
 
     def verify(self) -> str:
-        """Read all four input registers back, 0.26 ms at 400 kHz: empty, or what is not as it was told.
-
-        DAC D holds a pattern since the probe; a part that has restarted has lost it.
+        """Read all four input registers back, 0.26 ms at 400 kHz. Return an empty text, or what differs from the last
+        command. DAC D holds a pattern since the probe; a part that has restarted has lost it.
         """
         answer = self.answer_to_verify()
         spare = int.from_bytes(answer[2 * CHANNELS :], "big")

@@ -1,6 +1,6 @@
 """The transfers of ``DacOutput`` for a compiled loop, on the driver's own memory.
 
-A transfer that fails, and an answer that is not what the part was told, is kept for ``DacOutput.pending``: the driver's
+A transfer that fails, and an answer that differs from the command, is kept for ``DacOutput.pending``: the driver's
 next ``write`` or ``verify`` raises or reports it. Importing this module imports numba.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TRANSFER_NS, READ_BACK_NS, FAILED, WORDS = range(4)
 """Places in ``DacMemory.words``. ``READ_BACK_NS``: 0 if commands are not read back."""
 DIFFERS = 1 << 32
-"""``FAILED`` after an answer that is not what was told; other values are those of ``hal.i2c_kernels.transfer``."""
+"""``FAILED`` after an answer that differs from the command; other values are those of ``hal.i2c_kernels.transfer``."""
 REAL_TIME = -1
 
 guard_admit = kernel(admit)

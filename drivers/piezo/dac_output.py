@@ -1,7 +1,7 @@
-"""Implements analog outputs behind any I2C DAC with an amplifier.
+"""Implements analog outputs of any I2C DAC with an amplifier.
 
-A part is a subclass that defines the bytes on the bus. The DAC has no watchdog: the safe state is the firmware's
-duty, and a guardian may hold the same part through an object of its own.
+A part is a subclass that defines the bytes on the bus. The DAC has no watchdog, so the firmware must take it to the
+safe state; a guardian drives the same part through an object of its own (``firmware_py.guardian``).
 """
 
 from __future__ import annotations
@@ -11,26 +11,27 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from drivers.base import wait_s
 from drivers.options import OutputOptions
 from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import Clock, Float64Array, I2cBus
+from hal.arrays import Array
+from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, HalError, ProtocolError
 from hal.types import ChannelInfo, I2cOp, OutputLimit
 
 CHANNELS = 3
-RAMP_TICK_S = 0.001
 
 
 class OutputGate(Protocol):
-    """Asked immediately before every transfer that moves outputs, told when it is over."""
+    """Grants every transfer that moves outputs. ``firmware_py.guardian.gate.LeaseGate`` implements it."""
 
     def enter(self, codes: tuple[int, int, int]) -> None:
-        """May raise: then nothing is sent."""
+        """Called before a transfer with its codes. If it raises, nothing is sent."""
         ...
 
-    def leave(self) -> None: ...
+    def leave(self) -> None:
+        """Called after the transfer, also if that has raised."""
+        ...
 
 
 class DacOutput(GuardedOutput):
@@ -114,7 +115,7 @@ class DacOutput(GuardedOutput):
         raise NotImplementedError
 
     def segments(self, a: int, b: int, c: int) -> tuple[I2cOp, ...]:
-        """Return the transfer that moves all three outputs to these codes."""
+        """Return the transfer that moves outputs 1, 2 and 3 to the codes ``a``, ``b`` and ``c``."""
         raise NotImplementedError
 
     def codes_of(self, answer: bytes) -> list[int]:
@@ -122,7 +123,7 @@ class DacOutput(GuardedOutput):
         raise NotImplementedError
 
     def verify(self) -> str:
-        """Read the part back: empty, or what is not as it was told."""
+        """Read the part back. Return an empty text, or what differs from the last command."""
         raise NotImplementedError
 
     def transfer(self, ops: Sequence[I2cOp]) -> bytes:
@@ -131,7 +132,7 @@ class DacOutput(GuardedOutput):
 
     @property
     def is_ready(self) -> bool:
-        """True while nothing is odd: a compiled loop may command the part."""
+        """True if a compiled loop may command the part: it is armed, and no answer is pending."""
         return self._position_known and self.guard.armed and self.pending is None
 
     def answer_to_verify(self) -> bytes:
@@ -157,8 +158,9 @@ class DacOutput(GuardedOutput):
             yield
         self.guard.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
-        """Write ``values_V`` (3,). With ``read_back``, raises ``ProtocolError`` when the DAC holds another command."""
+    def write(self, values_V: Array) -> int:
+        """Write ``values_V`` (3,) and return the mask, both as ``AnalogOutput.write`` says. With ``read_back``, raises
+        ``ProtocolError`` if the DAC holds another command. Raises ``LeaseLost`` if the guardian has the outputs."""
         if self.pending is not None:
             a, b, c = (self._code(value_V) for value_V in self.guard.next_V)
             self._compare(self._take_pending(), (a, b, c))
@@ -167,6 +169,7 @@ class DacOutput(GuardedOutput):
         return mask
 
     def safe_step(self) -> bool:
+        """Make one step of the ramp; the first one reads the outputs back. Return True once neutral is read back."""
         if not self._position_known:
             self.guard.start_from([float(v) for v in self.readback_V()])
             self._position_known = True
@@ -179,7 +182,7 @@ class DacOutput(GuardedOutput):
         return done
 
     def lose_position(self) -> None:
-        """Somebody else has moved the outputs: the next ramp begins where they are found."""
+        """Note that the guardian may have moved the outputs: the next ramp reads them back first."""
         self._position_known = False
 
     def differences(self, codes: Sequence[int]) -> str:
@@ -189,7 +192,7 @@ class DacOutput(GuardedOutput):
                 return f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {commanded_V:.3f} V"
         return ""
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the input registers as volts (3,). They equal the outputs after each update command."""
         return np.array(self.read_codes(), dtype=np.float64) * self.lsb_V
 
@@ -197,9 +200,7 @@ class DacOutput(GuardedOutput):
         """Ramp to neutral unless there; the bus belongs to the bench and stays open."""
         if not self._position_known:
             return  # nothing was ever moved
-        with self.bringing_to_neutral():
-            while not self.guard.at_safe_state() and not self.safe_step():
-                wait_s(self._clock, RAMP_TICK_S)
+        self.ramp_to_neutral()
 
     def channels(self) -> Sequence[ChannelInfo]:
         limit = self.limits[0]

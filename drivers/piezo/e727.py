@@ -14,20 +14,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from drivers.base import next_due_ns, wait_s
+from drivers.base import next_due_ns
 from drivers.options import E727Options
 from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, LATE, PERIOD_NS, SUPERSEDED, WORDS
 from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
-from hal.contracts import Clock, Float64Array, SerialPort
+from hal.arrays import Array
+from hal.contracts import Clock, SerialPort
 from hal.errors import BenchError, WrongDevice
 from hal.types import ChannelInfo, OutputLimit
 from hal.wire_bits import serial_bits
 
 CHANNELS = 3
 RATE_MAX_HZ = 200.0
-TICK_S = 0.001
 EPSILON_V = 1e-4  # four decimals are sent
 COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
 """Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
@@ -76,7 +76,8 @@ class E727(GuardedOutput):
         self._text = np.zeros(0, np.uint8)
 
     def probe(self) -> str:
-        """Identity, axes and limits; the servo is switched as ``mode`` says. Raises ``WrongDevice``."""
+        """Check identity, axes and limits, switch the servo as ``mode`` says, and return the identity. Raises
+        ``WrongDevice``, or ``BenchError`` if the stage travels less than the limits allow."""
         self._load_kernels()  # from here on a ramp to neutral may be needed at once
         identity = self.link.query("*IDN?")[0]
         if "E-727" not in identity:
@@ -98,7 +99,7 @@ class E727(GuardedOutput):
         return identity
 
     def arming(self) -> Iterator[None]:
-        """Ramp to neutral, ask for errors, compare with what the controller says it was told."""
+        """Ramp to neutral, ask for errors, and compare neutral with the set points that the controller reports."""
         if not self._position_known:
             self.probe()
         self._load_kernels()
@@ -130,9 +131,10 @@ class E727(GuardedOutput):
         """Return the number of values that were given up, because the line was slower than asked for."""
         return self.words[LATE]
 
-    def write(self, values_V: Float64Array) -> int:
-        """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Between two command times only the newest values
-        count, the others are ``superseded``. Raises errors of the controller some commands later."""
+    def write(self, values_V: Array) -> int:
+        """Write ``values_V`` (3,) and return the mask, both as ``AnalogOutput.write`` says. Between two command times
+        nothing is sent: the values are checked and ``superseded``. An error of the controller is raised some commands
+        later."""
         self.link.take_error()
         now_ns = self._clock.now_ns()
         if now_ns < self.words[DUE_NS]:
@@ -147,8 +149,8 @@ class E727(GuardedOutput):
         return mask
 
     def safe_step(self) -> bool:
-        """Make one step of the ramp. Steps between two command times are not sent, except the last one. The first tick
-        may have to ask where the outputs are, 8 ms at 115200 baud: the ramp began before that."""
+        """Make one step of the ramp. Steps between two command times are not sent, except the last one. The first call
+        may have to query the outputs, 8 ms at 115200 baud; the ramp's time begins before that."""
         if not self._position_known:
             asked_ns = self._clock.now_ns()
             self.link.settle()  # else an answer to ``ERR?`` that is under way is taken for this one
@@ -164,7 +166,7 @@ class E727(GuardedOutput):
         self.guard.sent()
         return done
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         """Return the piezo voltages (3,) in V that the controller measures (``VOL?``)."""
         self.link.settle()
         return np.array(self.link.values("VOL? 1 2 3", CHANNELS))
@@ -172,9 +174,8 @@ class E727(GuardedOutput):
     def close(self) -> None:
         """Ramp to neutral unless there, then close the port."""
         try:
-            with self.bringing_to_neutral():
-                while self._position_known and not self.guard.at_safe_state() and not self.safe_step():
-                    wait_s(self._clock, TICK_S)
+            if self._position_known:
+                self.ramp_to_neutral()
         finally:
             self._position_known = False
             self.link.close()

@@ -108,7 +108,7 @@ class GcsLink:
         self.timeout_s = timeout_s
         self.memory = new_memory()
         self._stuck_ns = NEVER
-        """When the port took something last, since it has not taken all."""
+        """Time (bench clock) at which a port that does not take all bytes last took some, ``NEVER`` if it takes all."""
         self._buf = memoryview(bytearray(256))
 
     # set-up: may wait, bounded
@@ -131,8 +131,8 @@ class GcsLink:
         return [line.strip() for line in reply.decode("latin-1").splitlines()]
 
     def values(self, text: str, n: int) -> list[float]:
-        """The first ``n`` values of an answer with ``1=value`` per line. Raises ``ProtocolError`` for anything else,
-        fewer values included."""
+        """Return the first ``n`` values of an answer with ``1=value`` per line. Raises ``ProtocolError`` for anything
+        else, fewer values included."""
         lines = self.query(text)
         try:
             values = [float(line.split("=", 1)[1]) for line in lines]
@@ -157,8 +157,8 @@ class GcsLink:
     # in the loop: never waits
 
     def send(self, data: bytes) -> bool:
-        """Hand ``data`` to the port without waiting. False when an earlier command is still stuck: then nothing
-        of ``data`` was taken. Raises ``HalTimeout`` when the port has taken nothing for ``timeout_s``."""
+        """Hand ``data`` to the port without waiting. Return False if an earlier command is still stuck; nothing of
+        ``data`` was taken then. Raises ``HalTimeout`` when the port has taken nothing for ``timeout_s``."""
         if not self._is_free():
             return False
         keep_unsent(self.memory, data, 0, len(data))
@@ -166,7 +166,7 @@ class GcsLink:
         return True
 
     def ask_error(self) -> None:
-        """Send ``ERR?`` unless one is under way; ``take_error`` finds the answer later."""
+        """Send ``ERR?`` unless one is under way; ``take_error`` reads the answer later."""
         if not self._awaits and self.send(ERROR_QUERY):
             self.memory.asked_ns[0] = self._clock.now_ns()
 

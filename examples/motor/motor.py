@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 STEPS_HZ = 6000.0  # of the integration
 VARIANTS = {

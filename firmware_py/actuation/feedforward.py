@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hal.arrays import Array
+from hal.arrays import Array, ComplexArray
 
-Complex = NDArray[np.complex128]
-Answer = Callable[[Array], Complex]
+Answer = Callable[[Array], ComplexArray]
 """(n,) complex gain from demands that are held for a tick to the stroke, at (n,) Hz; 1 at rest."""
 
 
@@ -45,7 +43,7 @@ def design_feedforward(
     return np.concatenate([found, [1.0 - found.sum()]])
 
 
-def tracking_gain(taps: Array, answer: Answer, dt: float, preview_s: float, hz: Array) -> Complex:
+def tracking_gain(taps: Array, answer: Answer, dt: float, preview_s: float, hz: Array) -> ComplexArray:
     """(n,) complex ratio of what comes out to what was wanted at ``hz``: 1 is perfect."""
     z = np.exp(-2j * np.pi * hz * dt)
     return np.polynomial.polynomial.polyval(z, taps) * answer(hz) * np.exp(2j * np.pi * hz * preview_s)

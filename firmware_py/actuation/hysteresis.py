@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from firmware_py.actuation.config import StackConfig
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
+from hal.arrays import Array
 from hal.compiled import kernel
 
 UM = 1e-6

@@ -38,7 +38,8 @@ from firmware_py.frame import (
     TREMOR_AHEAD,
     TREMOR_CORE,
 )
-from firmware_py.records import Array, Integers, Records, attributes, copy_record, field, new, record
+from firmware_py.records import Records, attributes, copy_record, field, new, record
+from hal.arrays import Array, IntArray
 from hal.compiled import kernel
 from hal.scratch import scratch
 
@@ -90,7 +91,7 @@ class ActuateState:
     plays: Array = field("V", 3, "plays")
     creep: Array = field("m", 3, "creep")
     slopes: Array = field("m/V", "plays")
-    limited: Integers = field("1", len(LIMITS))  # ticks in which each limit took
+    limited: IntArray = field("1", len(LIMITS))  # ticks in which each limit took
 
 
 def geometry_of(config: ActuationConfig) -> Records[Geometry]:

@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Array, field, record
+from firmware_py.records import field, record
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch
 

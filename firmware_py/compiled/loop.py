@@ -38,8 +38,9 @@ from firmware_py.run.safety import State
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.task import TickInfo
 from firmware_py.scheduler.ticker import Ticks, silent_at_ns
+from hal.arrays import Array
 from hal.clock import VirtualClock
-from hal.contracts import AnalogOutput, Clock, Float64Array
+from hal.contracts import AnalogOutput, Clock
 from hal.errors import BenchError
 from hal.types import ScanBlock, TimeSource
 
@@ -331,7 +332,7 @@ class CompiledMicron(Micron):
             case at.STREAM:
                 self.scans.hand_over(self._failed_block)
             case at.GAP:
-                self.run.host_gaps.look(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
+                self.run.host_gaps.record(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
             case at.DEAF:
                 silent_ms = (self.run.clock.now_ns() - int(words[at.BEAT_NS])) * 1e-6
                 self.run.incidents.report(Finding.SUPERVISION_SILENT, silent_ms=silent_ms)
@@ -430,7 +431,7 @@ class CompiledMicron(Micron):
             self._call_back()
         return k
 
-    def _show(self, frame: Float64Array) -> None:
+    def _show(self, frame: Array) -> None:
         """Let everything in Python that reads the frame read ``frame``: the thread is at work on its own."""
         self.frame = self._watch.frame = frame
 

@@ -20,8 +20,8 @@ from drivers.output_guard_steps import CLIPPED, SLEW_LIMITED
 from drivers.piezo import can_loop, dac_loop, e727_loop
 from drivers.piezo.e727_loop import HANDED_OVER, SENT
 from drivers.piezo.gcs import UNSENT
-from firmware_py.guardian.gate import IS_ALONE, LEFT_NS, announce, has_lease, silence_ns
-from firmware_py.guardian.heart import BEAT, INSIDE
+from firmware_py.guardian.gate import NO_GUARDIAN, TRANSFER_END_NS, announce, has_lease, silence_ns
+from firmware_py.guardian.heartbeat import BEAT, IN_FLIGHT
 from hal.compiled import kernel
 from hal.fd_kernels import full_fence
 
@@ -31,39 +31,39 @@ gate_has_lease = kernel(has_lease)
 
 
 class GatedDac(NamedTuple):
-    """Holds a DAC and its lease: the words of ``Heart`` and of ``LeaseGate``, both (0,) without a guardian."""
+    """Holds a DAC and its lease: the words of ``Heartbeat`` and of ``LeaseGate``, both (0,) without a guardian."""
 
     dac: dac_loop.DacMemory
-    heart: NDArray[np.int64]
+    heartbeat: NDArray[np.int64]
     gate: NDArray[np.int64]
 
 
 @kernel
 def enter(out: GatedDac) -> bool:
     """Do what ``LeaseGate.enter`` does. Return False if it would raise: nothing may be sent then."""
-    heart, gate, codes = out.heart, out.gate, out.dac.codes
-    if len(heart) == 0:
+    heartbeat, gate, codes = out.heartbeat, out.gate, out.dac.codes
+    if len(heartbeat) == 0:
         return True
-    gate_announce(heart, gate, codes[0], codes[1], codes[2])
+    gate_announce(heartbeat, gate, codes[0], codes[1], codes[2])
     # the guardian must see the command before this side looks whether it has taken the outputs
     full_fence()  # pyright: ignore[reportCallIssue]
-    if gate[IS_ALONE] != 0:
+    if gate[NO_GUARDIAN] != 0:
         return True
     now = dac_loop.clock_ns(out.dac)
-    if not gate_has_lease(heart, gate, gate_silence(heart, now)):
-        heart[INSIDE] = 0
+    if not gate_has_lease(heartbeat, gate, gate_silence(heartbeat, now)):
+        heartbeat[IN_FLIGHT] = 0
         return False
-    heart[BEAT] = now
+    heartbeat[BEAT] = now
     return True
 
 
 @kernel
 def leave(out: GatedDac) -> None:
     """Do what ``LeaseGate.leave`` does."""
-    if len(out.heart) > 0:
-        out.gate[LEFT_NS] = dac_loop.clock_ns(out.dac)
+    if len(out.heartbeat) > 0:
+        out.gate[TRANSFER_END_NS] = dac_loop.clock_ns(out.dac)
         full_fence()  # pyright: ignore[reportCallIssue]
-        out.heart[INSIDE] = 0
+        out.heartbeat[IN_FLIGHT] = 0
 
 
 @kernel

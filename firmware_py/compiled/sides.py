@@ -251,8 +251,8 @@ class DacSide(Side):
         if virtual is not None:
             virtual.serve([dac.command, dac.check])
         none = np.zeros(0, np.int64)
-        heart = np.frombuffer(gate.heart.words, np.int64) if gate is not None else none
-        self._memory = GatedDac(dac, heart, np.frombuffer(gate.words, np.int64) if gate is not None else none)
+        heartbeat = np.frombuffer(gate.heartbeat.words, np.int64) if gate is not None else none
+        self._memory = GatedDac(dac, heartbeat, np.frombuffer(gate.words, np.int64) if gate is not None else none)
         return self._memory
 
     @property

@@ -53,14 +53,14 @@ class FieldInput:
                 self._look_for_outliers(volts, magnetometer.t_ns)
                 self.volts[:] = volts
                 self.fresh[0] = not hangs
-            incidents.bad_for(Finding.MAGNETOMETER_SILENT, False, info.due_ns, self._limit_ms, error="")
-            incidents.bad_for(
+            incidents.report_after(Finding.MAGNETOMETER_SILENT, False, info.due_ns, self._limit_ms, error="")
+            incidents.report_after(
                 Finding.MAGNETOMETER_HANGS, self._hangs, info.due_ns, self._limit_ms, device=magnetometer.name
             )
         except HalError as error:
             self._counts.magnetometer_errors += 1
             incidents.notice("magnetometer does not answer")
-            incidents.bad_for(Finding.MAGNETOMETER_SILENT, True, info.due_ns, self._limit_ms, error=error)
+            incidents.report_after(Finding.MAGNETOMETER_SILENT, True, info.due_ns, self._limit_ms, error=error)
 
     def _look_for_outliers(self, volts: NDArray[np.float64], t_ns: int) -> None:
         """Notice a reading out of line with its neighbours: the I2C bus has no checksum, so a flipped bit looks like

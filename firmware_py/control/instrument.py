@@ -38,7 +38,7 @@ from firmware_py.frame import (
     FrameStatus,
 )
 from firmware_py.run.context import Run
-from firmware_py.run.findings import Finding, finding_of_button, finding_of_output
+from firmware_py.run.findings import Finding, classify_button_error, classify_output_error
 from firmware_py.run.orders import PageOrders
 from firmware_py.run.safety import SelfTestLimits
 from firmware_py.run.tasks import TaskRow
@@ -112,8 +112,8 @@ class Micron:
         except HalError:  # it has been reported
             return None
 
-    def look_at(self, ticks: Ticks) -> None:
-        self.scans.look_at(ticks)
+    def inspect_ticks(self, ticks: Ticks) -> None:
+        self.scans.inspect_ticks(ticks)
 
     def rest(self) -> None:
         self.manual.stop()
@@ -143,7 +143,7 @@ class Micron:
         frame[COUNTS : COUNTS + len(scan)] = scan
         impossible = self._check.scan(scan, info.k)
         if impossible and (impossible := self._redundancy.impossible(self._check.channel, impossible)):
-            self.run.incidents.doubt(Finding.INPUT_IMPOSSIBLE, what=impossible)
+            self.run.incidents.report_reading(Finding.INPUT_IMPOSSIBLE, what=impossible)
         if self._field is not None:
             self._field.fill(frame)
 
@@ -170,11 +170,11 @@ class Micron:
         # check before the command goes out: a sensor that contradicts its twin must not move anything
         if self._redundancy.has_spare_axes:
             if unclear := self._redundancy.agree(self.frame):
-                incidents.doubt(Finding.AXES_CONTRADICT, what=unclear)
+                incidents.report_reading(Finding.AXES_CONTRADICT, what=unclear)
         elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (
             apart := self._check.pairs(self.frame) if disagreement is None else disagreement
         ):
-            incidents.doubt(Finding.PAIRS_DISAGREE, what=apart)
+            incidents.report_reading(Finding.PAIRS_DISAGREE, what=apart)
         status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:
             self._warn(status & ~self._warned)
@@ -198,7 +198,7 @@ class Micron:
         try:
             clipped = output.write(self.stages.command_V)
         except HalError as error:
-            run.incidents.report_error(finding_of_output(error), output.name, error)
+            run.incidents.report_error(classify_output_error(error), output.name, error)
             return
         run.counts.clipped += bool(clipped != 0 or int(self.frame[CLIP]) & ~CLIP_YIELD)
         if output.commands_sent == sent:
@@ -218,7 +218,7 @@ class Micron:
 
     def supervise(self, info: TickInfo) -> None:
         """Obey the page's orders, then check, at 100 Hz, what may end the run and no other task sees."""
-        self._orders.obey_all()
+        self._orders.handle_orders()
         self._watch.supervise(info)
 
     def verify(self, info: TickInfo) -> None:
@@ -245,7 +245,7 @@ class Micron:
             telemetry.send_tremor(self._amplitude_um(), float(frame[TREMOR_FREQUENCY]))
             telemetry.send_state(state, int(frame[STATUS]), run.counts.lost, skipped, worst_us)
         except HalError as error:
-            run.incidents.report_error(finding_of_button(error), telemetry.name, error)
+            run.incidents.report_error(classify_button_error(error), telemetry.name, error)
 
     # -- what people see ----------------------------------------------------------------------------------
 

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from firmware_py.frame import ACCELEROMETER, LAYOUT
-from firmware_py.records import Array, Integers, Records, attributes, field, new, record
+from firmware_py.records import Records, attributes, field, new, record
+from hal.arrays import Array, IntArray
 from hal.compiled import kernel
 from hal.validation import StrictTable
 
@@ -98,11 +99,11 @@ class CheckState:
 
     tick: int = field("1")  # last one that was checked, -1 before the first
     looks: int = field("1")  # how often pairs were checked
-    counts: Integers = field("counts", "n")  # of this scan, in the order of the inputs
-    last: Integers = field("counts", "n")
-    same: Integers = field("1", "n")  # how often ``last`` has come in a row, -1 before the first scan
-    slope: Integers = field("counts", "n")  # last change or NO_SLOPE
-    odd: Integers = field("1", "n")  # readings out of line: a second difference beyond ``outlier``, a supply's step
+    counts: IntArray = field("counts", "n")  # of this scan, in the order of the inputs
+    last: IntArray = field("counts", "n")
+    same: IntArray = field("1", "n")  # how often ``last`` has come in a row, -1 before the first scan
+    slope: IntArray = field("counts", "n")  # last change or NO_SLOPE
+    odd: IntArray = field("1", "n")  # readings out of line: a second difference beyond ``outlier``, a supply's step
     together: int = field("1")  # scans since all but three of the noisy inputs bent the same way at once
     window: Array = field("m/s^2", "window", 3)  # ring of the pairs' last differences
     sums: Array = field("m/s^2", 3)  # of the window
@@ -114,7 +115,7 @@ class CheckState:
 class CheckParams:
     """The limits. Only the first ``noisy`` inputs can be stuck."""
 
-    order: Integers = field("1", "n")  # places in a scan of the inputs
+    order: IntArray = field("1", "n")  # places in a scan of the inputs
     noisy: int = field("1")
     jump: int = field("counts")
     outlier: int = field("counts")
@@ -123,7 +124,7 @@ class CheckParams:
     high: int = field("counts")
     stuck: int = field("1")
     together: int = field("counts")  # second difference from which an input bends
-    places: Integers = field("1", 3, 2)
+    places: IntArray = field("1", 3, 2)
     mix: Array = field("1", 3, 3)  # see ``turns_of_pairs``
     pair_step: Array = field("m/s^2", 3)
     pair_limit: float = field("m/s^2")

@@ -12,7 +12,7 @@ import numpy as np
 
 from firmware_py.control.wiring import Daq
 from firmware_py.run.context import Run
-from firmware_py.run.findings import Finding, finding_of_scans
+from firmware_py.run.findings import Finding, classify_scan_error
 from firmware_py.scheduler.ticker import Ticks
 from hal.errors import HalError
 from hal.types import ScanBlock, Status, TimeSource
@@ -59,13 +59,13 @@ class ScanInput:
             else:
                 block = self._daq.read_scans(self.rows, timeout_s)
         except HalError as error:
-            self._run.host_gaps.look(due_ns, self._clock.now_ns())
+            self._run.host_gaps.record(due_ns, self._clock.now_ns())
             stall_ms = self._run.host_stalled_ms()
-            finding = finding_of_scans(error, stall_ms)
+            finding = classify_scan_error(error, stall_ms)
             self._incidents.report_error(finding, self._daq.name, error, stall_ms=stall_ms)
             self.failed = True
             raise
-        self._run.host_gaps.look(due_ns, self._clock.now_ns())
+        self._run.host_gaps.record(due_ns, self._clock.now_ns())
         self.block = block
         if block.n:
             self._newest_ns = block.t0_ns + (block.n - 1) * block.dt_ns
@@ -99,7 +99,7 @@ class ScanInput:
         self.block = ScanBlock(0, t_ns, self._period_ns, 0, TimeSource.HOST)
         return self.block
 
-    def look_at(self, ticks: Ticks) -> None:
+    def inspect_ticks(self, ticks: Ticks) -> None:
         """Report what the arrival of ``ticks`` reveals about the link and this host."""
         limits, name, holds = self._limits, self._daq.name, self._incidents.holds
         if ticks.n > 1:
@@ -128,7 +128,7 @@ class ScanInput:
             daq.stop()
             self.start()
         except HalError as error:
-            self._incidents.report_error(finding_of_scans(error, 0.0), daq.name, error, stall_ms=0.0)
+            self._incidents.report_error(classify_scan_error(error, 0.0), daq.name, error, stall_ms=0.0)
             return
         self.failed = False
         self._incidents.holds.interrupt(self._newest_ns, f"scans of {daq.name}")

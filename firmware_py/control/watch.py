@@ -9,7 +9,7 @@ from firmware_py.control.plausibility import ScanCheck
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.run.context import Run
-from firmware_py.run.findings import Finding, finding_of_button, finding_of_output
+from firmware_py.run.findings import Finding, classify_button_error, classify_output_error
 from firmware_py.run.safety import State
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
@@ -37,21 +37,21 @@ class Watch:
         status = int(frame[STATUS])
         t_ns = info.due_ns
         if status & FrameStatus.INVALID:
-            incidents.doubt(Finding.NOT_A_NUMBER)
+            incidents.report_reading(Finding.NOT_A_NUMBER)
         beyond, limit_ms = bool(status & FrameStatus.SATURATED), limits.saturated_ms
-        incidents.bad_for(Finding.SATURATED, beyond, t_ns, limit_ms, limit_ms=limit_ms)
+        incidents.report_after(Finding.SATURATED, beyond, t_ns, limit_ms, limit_ms=limit_ms)
         known = not status & FrameStatus.ALIGNING
         low, high = limits.temperature_C
         value = float(frame[TEMPERATURE])
         outside = known and not low <= value <= high
-        incidents.bad_for(Finding.TEMPERATURE_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
+        incidents.report_after(Finding.TEMPERATURE_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         low, high = limits.supply_V
         value = float(frame[SUPPLY])
         outside = known and not low <= value <= high
-        incidents.bad_for(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
+        incidents.report_after(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         if odd := self._check.odd():
             incidents.notice(odd)
-        self._run.look_after_guardian()
+        self._run.check_guardian()
         self._listen_to_the_button()
 
     def _listen_to_the_button(self) -> None:
@@ -62,7 +62,7 @@ class Watch:
             if telemetry.poll():
                 incidents.report(Finding.BUTTON_PRESSED)
         except HalError as error:
-            incidents.report_error(finding_of_button(error), telemetry.name, error)
+            incidents.report_error(classify_button_error(error), telemetry.name, error)
         if telemetry.button_silent() and (self._supervisor.may_move or self._supervisor.is_holding):
             incidents.report(Finding.BUTTON_SILENT, device=telemetry.name)
 
@@ -70,8 +70,8 @@ class Watch:
         """Run the read-back task (100 Hz, 300 Hz without a monitor): the amplifier must hold the value it was sent. A
         DAC that restarted or received a wrong value does not, nor one that rests beside neutral in a hold."""
         assert self._devices.verify_output is not None
-        care = self._run.guardian
-        rests = self._supervisor.state is State.HOLD and not (care is not None and care.heart.taken_ns)
+        lifecycle = self._run.guardian
+        rests = self._supervisor.state is State.HOLD and not (lifecycle is not None and lifecycle.heartbeat.taken_ns)
         if not (self._supervisor.may_move or rests):
             return
         name = self._devices.amplifier.name
@@ -79,13 +79,13 @@ class Watch:
             if wrong := self._devices.verify_output():
                 self._report_difference(f"{wrong}; check its supply and the bus")
         except HalError as error:
-            self._incidents.report_error(finding_of_output(error), name, error)
+            self._incidents.report_error(classify_output_error(error), name, error)
 
     def _report_difference(self, what: str) -> None:
         """Report that the outputs differ from the command. After a stall of this process they differ because the
         guardian has moved them; then that is reported instead."""
-        care, name = self._run.guardian, self._devices.amplifier.name
-        if care is not None and care.heart.taken_ns:
+        lifecycle, name = self._run.guardian, self._devices.amplifier.name
+        if lifecycle is not None and lifecycle.heartbeat.taken_ns:
             self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
         else:
             self._incidents.report(Finding.OUTPUT_DIFFERS, device=name, what=what)
@@ -107,7 +107,7 @@ class Watch:
             deaf, reason = True, f"{monitor.name}: {error}"
             monitor.forget()
             self._incidents.notice("amplifier monitor does not answer")
-        self._incidents.bad_for(Finding.MONITOR_DEAF, deaf, info.due_ns, limit_ms, error=reason)
+        self._incidents.report_after(Finding.MONITOR_DEAF, deaf, info.due_ns, limit_ms, error=reason)
 
     def waiting_for(self) -> list[str]:
         """Return the conditions that prevent arming, for the first time or after a hold."""

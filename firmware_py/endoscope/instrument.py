@@ -26,7 +26,7 @@ from firmware_py.endoscope.steering import Steering
 from firmware_py.endoscope.targets import GameState
 from firmware_py.endoscope.wiring import Sensor, Sensors
 from firmware_py.run.context import Run
-from firmware_py.run.findings import Finding, finding_of_sensor
+from firmware_py.run.findings import Finding, classify_sensor_error
 from firmware_py.run.orders import PageOrders
 from firmware_py.run.safety import SelfTestLimits
 from firmware_py.run.tasks import EVERY_TICK, TaskRow
@@ -170,7 +170,7 @@ class Endoscope:
     def poll(self) -> Ticks | None:
         return None
 
-    def look_at(self, ticks: Ticks) -> None:
+    def inspect_ticks(self, ticks: Ticks) -> None:
         if self._until_done and self.view.game.done:
             self.run.incidents.report(Finding.TARGETS_REACHED)
 
@@ -214,7 +214,7 @@ class Endoscope:
         """Hold the view, or end the run, for an error of the steering sensor; notice that of another one."""
         track.failed += 1
         if track is self.steering:
-            self.run.incidents.report_error(finding_of_sensor(error), track.sensor.name, error)
+            self.run.incidents.report_error(classify_sensor_error(error), track.sensor.name, error)
         else:
             self.run.incidents.notice(f"{track.sensor.name} does not answer")
 
@@ -241,7 +241,7 @@ class Endoscope:
 
     def watch(self, info: TickInfo) -> None:
         """Obey the page's orders, and hold the view when the steering sensor is silent."""
-        self._orders.obey_all()
+        self._orders.handle_orders()
         limit_ms = self.config.silent_ms
         if self.run.clock.now_ns() - self.steering.t_ns > limit_ms * 1e6:
             self.run.incidents.report(Finding.SAMPLES_MISSING, device=self.steering.sensor.name, limit_ms=limit_ms)

@@ -1,5 +1,6 @@
-"""A second process that takes the outputs to neutral when the firmware dies or stands still.
+"""Takes the outputs to neutral from a second process when the firmware dies or stands still.
 
-Here: the shared memory that carries the heartbeat, what the guardian does, its process, and the amplifier as the
-firmware sees it beside a guardian. Not here: the decision to stop while the firmware is alive (control/safety.py).
+What lives here: the heartbeat in shared memory, the guardian's state machine and its process, and the amplifier that
+the firmware uses beside a guardian. The guardian acts when no command has come for ``[firmware.safety] guardian_ms``.
+What must not: the decision to stop while the firmware is alive (``firmware_py.run.safety``).
 """

@@ -1,4 +1,4 @@
-"""A mark in shared memory that the kernel itself sets when the thread that holds it dies, whatever it died of.
+"""Detects the death of a thread by a mark in shared memory that the kernel sets, whatever the cause of death.
 
 The mark is a robust mutex (POSIX.1-2008, ``pthread_mutexattr_setrobust``) that its owner locks and never unlocks while
 it lives. On the owner's death the kernel sets one bit of the mutex (Linux, ``Documentation/locking/``
@@ -19,7 +19,7 @@ _PROCESS_SHARED = _ROBUST = 1
 
 
 class DeathMark:
-    """The mark at the begin of ``memory``, which is shared, writable and zero at first.
+    """Wraps the mark at the beginning of ``memory``, which is shared, writable and zero at first.
 
     One side calls ``hold`` from the thread whose death matters; the other looks at ``owner_died``.
     """
@@ -30,11 +30,11 @@ class DeathMark:
 
     @property
     def owner_died(self) -> bool:
-        """The thread that held the mark is dead: it commands nothing, and is inside no system call."""
+        """True if the thread that held the mark is dead: it sends no command and is inside no system call."""
         return bool(self._word[0] & OWNER_DIED)
 
     def hold(self) -> bool:
-        """Bind the mark to the calling thread; False where the system has no robust mutexes."""
+        """Bind the mark to the calling thread. Return False if the system has no robust mutexes."""
         library: Any = ctypes.CDLL(None)
         attribute = ctypes.create_string_buffer(MARK_BYTES)
         try:
@@ -49,6 +49,6 @@ class DeathMark:
             return False
 
     def release(self) -> None:
-        """Unbind it, by the thread that holds it: its end is no death then."""
+        """Unbind the mark, so that the end of the thread is no death. The thread that holds the mark must call this."""
         library: Any = ctypes.CDLL(None)
         library.pthread_mutex_unlock(self._mutex)

@@ -1,10 +1,10 @@
-"""The guardian's process and its handle in the firmware.
+"""Runs the guardian in a process of its own, and gives the firmware a handle of it.
 
 The firmware's loop holds a mark in shared memory (``mark.py``) and the writing end of a pipe. When it dies, by whatever
-cause, the kernel sets the mark at once, which the guardian looks at every millisecond, and closes the pipe once it has
-freed the firmware's memory, which takes tens of milliseconds. That the firmware stands still is seen in the heartbeat.
-The guardian has its own connection to the amplifier's bus, opened at the start; it outlives the firmware, and ends when
-the outputs are neutral and stay so.
+cause, the kernel sets the mark at once, which the guardian checks every millisecond, and closes the pipe once it has
+freed the firmware's memory, which takes tens of milliseconds. The heartbeat shows that the firmware stands still.
+The guardian opens its own connection to the amplifier's bus at the start; it outlives the firmware, and ends when the
+outputs have stayed at neutral.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from drivers.registry import find_driver
-from firmware_py.guardian.care import start_failed
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
-from firmware_py.guardian.heart import Heart, Why
+from firmware_py.guardian.heartbeat import Heartbeat, TakeoverReason
+from firmware_py.guardian.lifecycle import start_error
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from hal.backends import open_i2c
 from hal.children import child_command, child_environment
@@ -33,52 +33,53 @@ from hal.contracts import Clock
 from hal.errors import HalError, OpenFailed
 
 PRIORITY = 85  # above the loop: it does almost nothing, but must do it while the loop is stuck
-LOOK_NS = 200_000
-"""The guardian looks so long after a command began: the loop then waits for its bus, and nobody computes. A step at
-another time takes the processor from the loop or from what it waits for."""
+STEP_DELAY_NS = 200_000
+"""Delay from the beginning of a command to the guardian's step. The loop then waits for its bus and needs no processor,
+which a step at another time would take from it."""
 START_S = 30.0
 END_S = 5.0
-"""Time that the guardian may take to end beyond its retries."""
+"""Time limit for the end of the guardian after its retries."""
 END_POLL_S = 0.002
 REPORT = "guardian.json"
 STARTED = "guardian.started"
-"""There is a guardian; the file holds the seconds for which it may try to reach neutral."""
+"""File that exists once a guardian was started; it holds the time (s) for which a ramp is retried."""
 
 
 class GuardianProcess:
-    """``Keeper`` of a guardian in a process of its own. Start it before real-time settings are made.
+    """Implements ``GuardianHandle`` for a guardian in a process of its own. Create it before real-time settings are
+    made.
 
-    ``order``: uri, speed_hz, driver and options of the output, notice_ms, limit_ms, retry_s; see ``main``. The guardian
-    starts at once; ``await_ready`` says whether it came up. ``may_end_us``: this process is the firmware and nothing
-    else, and may be killed when it stands still within a command.
+    ``settings``: uri, speed_hz, driver and options of the output, notice_ms, limit_ms, retry_s; ``main`` reads them.
+    The guardian starts at once; ``await_ready`` waits for it. ``may_be_killed``: this process is the firmware and
+    nothing else, so the guardian may kill it when it stands still within a command.
     """
 
-    def __init__(self, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> None:
-        self.heart = Heart.shared()
-        self.heart.mark.hold()
-        # the loop may be pinned to a processor when a guardian is replaced, which is not to be its guardian's
-        self._order: dict[str, Any] = {**order, "processors": sorted(os.sched_getaffinity(0))}
+    def __init__(self, settings: dict[str, Any], runtime_dir: Path, *, may_be_killed: bool = False) -> None:
+        self.heartbeat = Heartbeat.shared()
+        self.heartbeat.mark.hold()
+        # a guardian that replaces another one must not run on the processor to which the loop is pinned
+        self._settings: dict[str, Any] = {**settings, "processors": sorted(os.sched_getaffinity(0))}
         self._report = runtime_dir / REPORT
-        self._may_end_us = may_end_us
+        self._may_be_killed = may_be_killed
         self._is_ready = False
-        (runtime_dir / STARTED).write_text(str(order["retry_s"]), encoding="utf-8")
+        (runtime_dir / STARTED).write_text(str(settings["retry_s"]), encoding="utf-8")
         self._process, self._pipe = self._start()
 
     def _start(self) -> tuple[subprocess.Popen[bytes], int]:
-        assert self.heart.fd is not None
+        assert self.heartbeat.fd is not None
         guardian_end, own_end = os.pipe()
-        ourselves = os.pidfd_open(os.getpid()) if self._may_end_us else -1
-        order = {**self._order, "heart": self.heart.fd, "pipe": guardian_end, "firmware": ourselves}
+        ourselves = os.pidfd_open(os.getpid()) if self._may_be_killed else -1
+        settings = {**self._settings, "heartbeat": self.heartbeat.fd, "pipe": guardian_end, "firmware": ourselves}
         process = subprocess.Popen(
-            child_command("firmware_py.guardian.process", json.dumps({**order, "report": str(self._report)})),
+            child_command("firmware_py.guardian.process", json.dumps({**settings, "report": str(self._report)})),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            pass_fds=(self.heart.fd, guardian_end, *((ourselves,) if self._may_end_us else ())),
+            pass_fds=(self.heartbeat.fd, guardian_end, *((ourselves,) if self._may_be_killed else ())),
             env=child_environment(),
             start_new_session=True,  # Ctrl-C is for the firmware
         )
         os.close(guardian_end)
-        if self._may_end_us:
+        if self._may_be_killed:
             os.close(ourselves)
         return process, own_end
 
@@ -91,55 +92,55 @@ class GuardianProcess:
         return self._is_ready and self._process.poll() is None
 
     def await_ready(self) -> None:
-        """Raises ``OpenFailed`` when the guardian has no way to the amplifier."""
+        """Wait until the guardian is ready. Raises ``OpenFailed`` if it cannot reach the amplifier."""
         try:
-            if not self._has_come_up(START_S):
-                raise start_failed(f"no word from it within {START_S:g} s")
+            if not self._is_ready_within(START_S):
+                raise start_error(f"no word from it within {START_S:g} s")
         except HalError as error:
             self.stop()
             raise OpenFailed([error]) from error
 
-    def came_up(self) -> bool:
-        return self._has_come_up(0.0)
+    def finish_replacement(self) -> bool:
+        return self._is_ready_within(0.0)
 
-    def _has_come_up(self, timeout_s: float) -> bool:
+    def _is_ready_within(self, timeout_s: float) -> bool:
         assert self._process.stdout is not None
         if not select.select([self._process.stdout], (), (), timeout_s)[0]:
             return False
         line = self._process.stdout.readline().decode().strip()
         if line != "ready":
-            raise start_failed(line or "it ended without a word")
+            raise start_error(line or "it ended without a word")
         self._is_ready = True
         return True
 
-    def evict(self) -> None:
-        """End it now; it commands nothing any more when this returns."""
+    def kill(self) -> None:
+        """End the guardian now. It sends no command after this returns."""
         self._process.kill()
         self._process.wait()
 
-    def replace(self) -> None:
-        """End it and begin to start another one, which ``came_up`` asks for."""
-        self.evict()
+    def begin_replacement(self) -> None:
+        """End the guardian and begin to start another one. Return at once; ``finish_replacement`` follows."""
+        self.kill()
         assert self._process.stdout is not None
         self._process.stdout.close()
         os.close(self._pipe)
-        self.heart.forget_guardian()
+        self.heartbeat.clear_guardian()
         self._is_ready = False
         self._process, self._pipe = self._start()
 
-    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent.
+    def stop(self, is_interrupted: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        """Let the guardian end once the outputs are at rest, and return its report, ``None`` without one. Idempotent.
 
-        When the caller is in a ``hurry``, the guardian goes on alone and its report is not waited for.
+        Once ``is_interrupted`` returns True, the guardian goes on alone and its report is not waited for.
         """
         if self._pipe >= 0:
             os.close(self._pipe)
             self._pipe = -1
-            self.heart.mark.release()
-            deadline_s = time.monotonic() + self._order["retry_s"] + END_S
-            while self._process.poll() is None and not hurry():
+            self.heartbeat.mark.release()
+            deadline_s = time.monotonic() + self._settings["retry_s"] + END_S
+            while self._process.poll() is None and not is_interrupted():
                 if time.monotonic() > deadline_s:
-                    self.evict()
+                    self.kill()
                 time.sleep(END_POLL_S)
             assert self._process.stdout is not None
             self._process.stdout.close()
@@ -148,68 +149,69 @@ class GuardianProcess:
         return None
 
 
-def pause_ns(beat_ns: int, now_ns: int) -> int:
-    """Return the time to the next step: a millisecond, or up to half of one less, so that the steps come ``LOOK_NS``
-    after a command began."""
-    late_ns = (now_ns - beat_ns - LOOK_NS + STEP_NS // 2) % STEP_NS - STEP_NS // 2
+def compute_pause_ns(beat_ns: int, now_ns: int) -> int:
+    """Return the time to the next step: a millisecond, or up to half of one less, so that the steps come
+    ``STEP_DELAY_NS`` after a command began. ``beat_ns`` is when the last command began."""
+    late_ns = (now_ns - beat_ns - STEP_DELAY_NS + STEP_NS // 2) % STEP_NS - STEP_NS // 2
     return STEP_NS - max(0, late_ns)
 
 
-def serve(guardian: Guardian, heart: Heart, clock: Clock, pipe: int) -> None:
-    """Step ``guardian`` until the outputs need none any more.
+def run_guardian(guardian: Guardian, heartbeat: Heartbeat, clock: Clock, pipe: int) -> None:
+    """Step ``guardian`` until it ends.
 
-    The firmware is dead when the mark of ``heart`` says so or ``pipe`` has no writer any more, whichever comes first.
+    The firmware is dead once its mark in ``heartbeat`` says so or ``pipe`` has no writer, whichever comes first.
     """
     open_pipe = [pipe]
     while guardian.state is not State.DONE:
-        pause_s = pause_ns(heart.beat_ns, clock.now_ns()) * 1e-9
+        pause_s = compute_pause_ns(heartbeat.beat_ns, clock.now_ns()) * 1e-9
         if select.select(open_pipe, (), (), pause_s)[0] and not os.read(pipe, 64):
             open_pipe = []
-        guardian.step(alive=bool(open_pipe) and not heart.mark.owner_died)
+        guardian.step(alive=bool(open_pipe) and not heartbeat.mark.owner_died)
 
 
 def main(arguments: list[str]) -> int:
-    """``python -m firmware_py.guardian.process ORDER`` (JSON)."""
-    order = json.loads(arguments[0])
+    """Run ``python -m firmware_py.guardian.process SETTINGS`` (JSON). Return the exit status: 0 after a watch, 1 if the
+    amplifier cannot be reached, with the reason on standard output."""
+    settings = json.loads(arguments[0])
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the firmware, not with its terminal
     with suppress(OSError):
-        os.sched_setaffinity(0, order["processors"])
+        os.sched_setaffinity(0, settings["processors"])
     clock = MonotonicClock()
     try:
-        bus = open_i2c(order["uri"], speed_hz=order["speed_hz"], exclusive=False)
-        part = find_driver(order["driver"]).leased
+        bus = open_i2c(settings["uri"], speed_hz=settings["speed_hz"], exclusive=False)
+        part = find_driver(settings["driver"]).leased
         assert part is not None  # the firmware asks for a guardian of such outputs alone
-        amplifier = part(bus, clock, **order["options"])
+        amplifier = part(bus, clock, **settings["options"])
         amplifier.readback_V()
     except HalError as error:
         sys.stdout.write(f"{error}\n")
         return 1
-    firmware = order["firmware"]
-    heart = Heart(order["heart"])
+    firmware = settings["firmware"]
+    heartbeat = Heartbeat(settings["heartbeat"])
     guardian = Guardian(
-        heart, amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"],
-        retry_s=order["retry_s"],
-        end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
+        heartbeat, amplifier, clock, notice_ms=settings["notice_ms"], limit_ms=settings["limit_ms"],
+        retry_s=settings["retry_s"],
+        kill_firmware=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
     )  # fmt: skip
     with realtime(RealtimeConfig(priority=PRIORITY)):
-        # not before: from its word on a guardian that is silent for 100 ms counts as lost, and the settings may take so
-        # long on a busy machine
+        # only now: a guardian that has reported ready and is silent for 100 ms counts as lost, and the settings may
+        # take so long on a busy machine
         sys.stdout.write("ready\n")
         sys.stdout.flush()
-        serve(guardian, heart, clock, order["pipe"])
+        run_guardian(guardian, heartbeat, clock, settings["pipe"])
     report = guardian.report()
-    partial = Path(order["report"] + ".partial")
-    with suppress(OSError):  # whoever wanted it may have cleaned up
+    partial = Path(settings["report"] + ".partial")
+    with suppress(OSError):  # the run may have removed its folder already
         partial.write_text(json.dumps(report), encoding="utf-8")
-        partial.rename(order["report"])
-    if report["why"] != Why.NOTHING.name.lower():
+        partial.rename(settings["report"])
+    if report["why"] != TakeoverReason.NOTHING.name.lower():
         sys.stderr.write(f"micron guardian: {describe(report)}\n")
     return 0
 
 
 def describe(report: dict[str, Any]) -> str:
-    """A report in words."""
+    """Return a guardian's report (``Guardian.report``) in words."""
     if report["taken_ns"] is None:
         return "the firmware died with its outputs at neutral; the guardian had nothing to do"
     why = {"died": "the firmware died", "silent": "the loop stood still"}[report["why"]]

@@ -14,12 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError
+from hal.arrays import Array
 from hal.jsonable import to_jsonable
-
-Float64Array = NDArray[np.float64]
 
 PROFILE = "micron"
 TICKS_TOPIC, TICKS_SCHEMA, TICKS_ENCODING = "ticks", "micron.ticks", "x-micron-ticks"
@@ -52,7 +50,7 @@ class Block(NamedTuple):
     """``data[n_columns, n_rows]``; its first row is row ``row0`` of the run, dropped rows counted."""
 
     row0: int
-    data: Float64Array
+    data: Array
 
 
 def check_columns(columns: Sequence[tuple[str, str]]) -> tuple[ColumnInfo, ...]:
@@ -156,7 +154,7 @@ def events_schema() -> bytes:
     ).encode()
 
 
-def encode_block(row0: int, rows: Float64Array, crc: int) -> bytes:
+def encode_block(row0: int, rows: Array, crc: int) -> bytes:
     """Message of the rows ``rows[n_rows, n_columns]``, numbered from ``row0``; ``crc`` is ``layout_crc``."""
     n_rows, n_columns = rows.shape
     columns = np.ascontiguousarray(rows.T, dtype="<f8")

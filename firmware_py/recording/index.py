@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
-from firmware_py.recording.format import ColumnInfo, Float64Array
+from firmware_py.recording.format import ColumnInfo
 from firmware_py.recording.scan import (
     Channel,
     ChunkMessage,
@@ -28,6 +28,7 @@ from firmware_py.recording.scan import (
     chunk_records,
     read_chunk,
 )
+from hal.arrays import Array
 
 _FRAME = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<QQI")
@@ -41,7 +42,7 @@ CACHED_CHUNKS = 1500
 class Rows(NamedTuple):
     """Times [n] in s and values [columns, n] of consecutive rows."""
 
-    t_s: Float64Array
+    t_s: Array
     values: NDArray[np.float32]
 
 
@@ -103,7 +104,7 @@ class IndexedRecording:
 
     def _read(self, number: int) -> Rows:
         crc = fmt.layout_crc(self.columns)
-        parts: list[Float64Array] = []
+        parts: list[Array] = []
         try:
             content = read_chunk(self._file, int(self._offset[number]))
             for record in chunk_records(content):
@@ -135,7 +136,7 @@ class IndexedRecording:
         if fmt.TIME_COLUMN not in self.names:
             raise RecordingError(f"{self.path} has no column {fmt.TIME_COLUMN!r}: it cannot be shown over time")
 
-    def _read_index(self) -> tuple[NDArray[np.int64], Float64Array]:
+    def _read_index(self) -> tuple[NDArray[np.int64], Array]:
         """Return place [n] and last time [n] in s of every chunk, from the summary at the end of the file."""
         torn = RecordingError(
             f"{self.path} has no index: it was torn, or is still being written. 'micron recover' makes it whole"

@@ -12,12 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 from mcap.records import Channel, Schema
-from numpy.typing import NDArray
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import is_being_recorded
-from firmware_py.recording.format import Block, ColumnInfo, Float64Array
+from firmware_py.recording.format import Block, ColumnInfo
 from firmware_py.recording.health import Health, RowGap, TickGap
 from firmware_py.recording.scan import (
     ChunkMessage,
@@ -32,8 +31,7 @@ from firmware_py.recording.scan import (
     read_chunk,
 )
 from firmware_py.recording.unpack import FileTooExpansive
-
-IndexArray = NDArray[np.int64]
+from hal.arrays import Array, IntArray
 
 _MAX_LISTED = 1000
 MOST_EVENT_BYTES = 1 << 20
@@ -137,7 +135,7 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be read ({error.strerror})") from error
 
-    def array(self, names: Sequence[str]) -> Float64Array:
+    def array(self, names: Sequence[str]) -> Array:
         """``[n_rows, len(names)]``, the whole recording."""
         indices = [self._index(name) for name in names]
         result = np.empty((self.n_rows, len(indices)))
@@ -148,11 +146,11 @@ class Recording:
             start = stop
         return result
 
-    def column(self, name: str) -> Float64Array:
+    def column(self, name: str) -> Array:
         """Return one column (n_rows,)."""
         return self.array([name])[:, 0]
 
-    def arrays(self) -> dict[str, Float64Array]:
+    def arrays(self) -> dict[str, Array]:
         """Return all columns (n_rows,) by name; this takes ``8 * n_rows * n_columns`` bytes of memory."""
         everything = np.ascontiguousarray(self.array(self.names).T)
         return dict(zip(self.names, everything, strict=True))
@@ -364,11 +362,11 @@ class _Places:
     def __init__(self) -> None:
         self._raw = array("q")
         self.n_rows = 0
-        self.order: IndexArray = np.empty(0, dtype=np.int64)
-        self.row0: IndexArray = self.order
-        self.n: IndexArray = self.order
-        self._chunk: IndexArray = self.order
-        self._at: IndexArray = self.order
+        self.order: IntArray = np.empty(0, dtype=np.int64)
+        self.row0: IntArray = self.order
+        self.n: IntArray = self.order
+        self._chunk: IntArray = self.order
+        self._at: IntArray = self.order
 
     def add(self, chunk: int, at: int, row0: int, n_rows: int, crc: int) -> None:
         self._raw.extend((chunk, at, row0, n_rows, crc))
@@ -397,7 +395,7 @@ class _Places:
         changes = np.concatenate(([True], self._chunk[1:] != self._chunk[:-1]))[: len(self._chunk)]
         return self._chunk[changes].tolist()
 
-    def row_numbers(self) -> IndexArray:
+    def row_numbers(self) -> IntArray:
         """Return the number of every row, ``[n_rows]``."""
         starts = np.cumsum(self.n) - self.n
         return np.arange(self.n_rows) + np.repeat(self.row0 - starts, self.n)
@@ -451,7 +449,7 @@ class _TickCheck:
             TickGap(int(ticks[at]), int(ticks[at + 1])) for at in jumps[: _MAX_LISTED - len(self._inside)]
         )
 
-    def result(self, order: IndexArray, row0: IndexArray, n: IndexArray) -> _Ticks:
+    def result(self, order: IntArray, row0: IntArray, n: IntArray) -> _Ticks:
         """Return the result over the blocks ``order``, which begin at ``row0`` and hold ``n`` rows. Nothing is
         concluded across missing rows."""
         first, last, inside = np.frombuffer(self._edges, dtype=np.int64).reshape(-1, 3)[order].T

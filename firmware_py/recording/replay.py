@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_py.recording.errors import RecordingError
-from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
+from hal.arrays import Array
 
 
 class ReplayBlock(NamedTuple):
     """Rows ``number`` and following: ``inputs`` (n, n_inputs) and ``recorded`` (n, n_outputs), C order."""
 
     number: int
-    inputs: Float64Array
-    recorded: Float64Array
+    inputs: Array
+    recorded: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def replay_blocks(recording: Recording, inputs: Sequence[str], outputs: Sequence
 
 def replay(
     recording: Recording,
-    run: Callable[[Float64Array], Float64Array],
+    run: Callable[[Array], Array],
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> ReplayReport:

@@ -21,12 +21,9 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError
-
-Float64Array = NDArray[np.float64]
-Int64Array = NDArray[np.int64]
+from hal.arrays import Array, IntArray
 
 _HEADER_BYTES = 4096
 # words of the header; each side's words on a cache line of its own
@@ -83,11 +80,11 @@ class RowsView(NamedTuple):
     """Holds a ring's memory for ``put_row``: ``words`` [header], ``numbers`` [capacity], ``rows`` [capacity, n]."""
 
     words: Any
-    numbers: Int64Array
-    rows: Float64Array
+    numbers: IntArray
+    rows: Array
 
 
-def put_row(view: RowsView, row: Float64Array) -> bool:
+def put_row(view: RowsView, row: Array) -> bool:
     """Copy ``row`` to the next free slot; ``announce_row`` follows. Return False, and count it, when the ring is full.
 
     A compiled loop runs the same two functions, with a fence for the compiler between them: a row must be there before
@@ -122,8 +119,8 @@ class RowRing:
         self._words = self._shared.words
         self.capacity, self.n_columns = self._words[_SIZE], self._words[_WIDTH]
         slots = np.frombuffer(self._shared.data(), dtype=np.float64).reshape(self.capacity, 1 + self.n_columns)
-        self._numbers: Int64Array = slots.view(np.int64)[:, 0]
-        self._rows: Float64Array = slots[:, 1:]
+        self._numbers: IntArray = slots.view(np.int64)[:, 0]
+        self._rows: Array = slots[:, 1:]
         self._own = RowsView(self._words, self._numbers, self._rows)
 
     @classmethod
@@ -137,7 +134,7 @@ class RowRing:
     def fd(self) -> int:
         return self._shared.fd
 
-    def push(self, row: Float64Array) -> bool:
+    def push(self, row: Array) -> bool:
         """Copy ``row[n_columns]`` in; False (and counted) when the ring is full. Never waits."""
         if not put_row(self._own, row):
             return False
@@ -152,7 +149,7 @@ class RowRing:
         """Return True if the next ``push`` would be refused."""
         return self._words[_HEAD] - self._words[_TAIL] >= self.capacity
 
-    def pop(self, max_rows: int) -> tuple[Int64Array, Float64Array]:
+    def pop(self, max_rows: int) -> tuple[IntArray, Array]:
         """Take up to ``max_rows`` of the oldest rows: their numbers ``[n]`` and values ``[n, n_columns]``."""
         tail = self._words[_TAIL]
         slot = tail % self.capacity

@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import lock, refuse_existing
-from firmware_py.recording.format import Float64Array
+from hal.arrays import Array
 from hal.jsonable import to_jsonable
 
 
@@ -149,7 +149,7 @@ class RecordingWriter:
         schema = self._mcap.register_schema(fmt.EVENTS_SCHEMA, "jsonschema", fmt.events_schema())
         self._mcap.register_channel(fmt.EVENTS_TOPIC, fmt.EVENTS_ENCODING, schema)
 
-    def write_block(self, row0: int, rows: Float64Array) -> None:
+    def write_block(self, row0: int, rows: Array) -> None:
         """Write ``rows[n, n_columns]``, numbered on from ``row0``, as a chunk of its own with the events before it.
 
         In the file ``publish_time`` is the time of the first row, ``log_time`` that of the last one.
@@ -235,7 +235,7 @@ class RecordingWriter:
         """Return ``end`` with the names of the texts added, so that a reader notices a lost one."""
         return {**end, "metadata": self._metadata_names}
 
-    def _time_ns(self, row: Float64Array) -> int:
+    def _time_ns(self, row: Array) -> int:
         t_s = float(row[self._time_column]) if self._time_column is not None else math.nan
         return round(t_s * 1e9) if 0.0 <= t_s < 1e9 else self._now_ns
 

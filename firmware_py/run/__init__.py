@@ -1,4 +1,4 @@
-"""Runs an instrument: the loop, what stops it, who is told, what is reported. The same for every instrument.
+"""Runs any instrument: the loop, the findings that stop it, recorder and page, and the report of the run.
 
 What lives here: everything that two instruments have in common. An instrument is a table of tasks, a function that
 opens its devices, and a report (``instrument.py`` has the protocols). ``tasks.py`` defines a row of the table; the

@@ -1,4 +1,4 @@
-"""Holds what every part of a running instrument uses: clock, limits, counters, supervisor, and who is told."""
+"""Holds what every part of a running instrument uses: clock, limits, counters, supervisor, recorder and page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.guardian.care import GuardianCare
+from firmware_py.guardian.lifecycle import GuardianLifecycle
 from firmware_py.live.link import LiveLink
 from firmware_py.run.findings import Finding
 from firmware_py.run.host_gaps import HostGaps
@@ -31,9 +31,9 @@ class Run:
     ``period_ns`` is the tick period. ``output`` moves the actuators, ``None`` for an instrument without outputs;
     ``guardian`` looks after its guardian process. ``limits`` are ``[firmware.safety]`` of the bench file.
     ``on_status`` gets a small dict now and then and must not block. ``sense_only``: nothing is armed, and a reading
-    that would end a run is only noticed. ``others_stalled_ms(now_ns, within_ms)`` returns how long another process of
-    this host, which answers for devices, stands or stood still. ``spares_host``: pauses of this host do not end the run
-    by their number, because no device is real.
+    that would end a run is only noticed. ``other_stall_ms(now_ns, within_ms)`` returns for how long another process of
+    this host, which emulates devices, has stood still (ms), 0 if it has not. ``allows_host_stalls``: holds that pauses
+    of this host cause do not count towards ``holds_per_minute``, because no device is real.
     """
 
     clock: Clock
@@ -43,10 +43,10 @@ class Run:
     recorder: Recorder | None = None
     live: LiveLink | None = None
     on_status: StatusSink | None = None
-    guardian: GuardianCare | None = None
+    guardian: GuardianLifecycle | None = None
     sense_only: bool = False
-    others_stalled_ms: Callable[[int, float], float] | None = None
-    spares_host: bool = False
+    other_stall_ms: Callable[[int, float], float] | None = None
+    allows_host_stalls: bool = False
 
     counts: LoopCounts = field(init=False, default_factory=LoopCounts)
     signals: Signals = field(init=False, default_factory=Signals)
@@ -55,9 +55,9 @@ class Run:
     host_gaps: HostGaps = field(init=False)
     scheduler: Scheduler = field(init=False)
     ticks: Ticks | None = field(init=False, default=None)
-    """The ticks under way: number, due time (ns, device clock) and distance (ns) of the scans that have arrived."""
+    """The ticks under way: number, due time and distance (bench time, ns) of the scans that have arrived."""
     started_ns: int = field(init=False, default=0)
-    """Bench time at which a recording's time begins."""
+    """Bench time (ns) at which a recording's time begins."""
     end_ns: int | None = field(init=False, default=None)
     """Bench time at which the run has lasted as long as it was asked to; ``None`` before it is armed."""
     armed_ns: int | None = field(init=False, default=None)
@@ -67,12 +67,17 @@ class Run:
     safe_reached_ns: int | None = field(init=False, default=None)
     """Bench time at which the ramp to the safe state reached neutral; ``None`` when it has not."""
     ramp_given_up: bool = field(init=False, default=False)
-    """The operator has interrupted a ramp that is retried."""
+    """True once the operator has interrupted a ramp that is retried."""
 
     def __post_init__(self) -> None:
         self.supervisor = Supervisor(self.output)
         self.incidents = Incidents(
-            self.supervisor, self.counts, self.clock, self.recorder, self.limits, spares_host=self.spares_host
+            self.supervisor,
+            self.counts,
+            self.clock,
+            self.recorder,
+            self.limits,
+            allows_host_stalls=self.allows_host_stalls,
         )
         self.host_gaps = HostGaps(self.limits.stale_ms)
 
@@ -86,13 +91,13 @@ class Run:
     def host_stalled_ms(self) -> float:
         """Return how long (ms) this loop or another process of this host has just stood still, 0 if neither has."""
         now_ns, within_ms = self.clock.now_ns(), 2.0 * self.limits.stale_ms
-        others_ms = self.others_stalled_ms(now_ns, within_ms) if self.others_stalled_ms is not None else 0.0
+        others_ms = self.other_stall_ms(now_ns, within_ms) if self.other_stall_ms is not None else 0.0
         return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
 
-    def look_after_guardian(self) -> None:
-        """Report a lost guardian. Heartbeats go both ways: outputs do not move without a guardian that would take them
-        to neutral."""
-        if self.guardian is not None and self.supervisor.is_active and (why := self.guardian.look()):
+    def check_guardian(self) -> None:
+        """Report a guardian that is lost, so that the outputs do not move without a process that would take them to
+        neutral if this one died."""
+        if self.guardian is not None and self.supervisor.is_active and (why := self.guardian.check()):
             self.incidents.report(Finding.GUARDIAN_LOST, what=why)
 
     def restore_guardian(self) -> None:
@@ -107,7 +112,8 @@ class Run:
             self.incidents.report(Finding.GUARDIAN_FAILED, error=error)
 
     def step_ramp(self) -> None:
-        """Run one step of the outputs' ramp to neutral, and note when neutral is reached."""
+        """Run one step of the outputs' ramp to neutral, and note the bench time at which neutral is reached. The task
+        that actuates calls this in every tick; ``finish_ramp`` does once the ticks have ended."""
         supervisor = self.supervisor
         was_holding = supervisor.is_holding
         if supervisor.step(may_retry=self._may_retry()) and self.safe_reached_ns is None:

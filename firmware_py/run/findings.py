@@ -3,7 +3,8 @@
 A finding is *recoverable* or *latched*. A recoverable one has a cause that can pass, and what follows can be checked
 before the outputs move again: the outputs ramp to neutral, hold there, and go on (``holds.py``). A latched one says
 that what is known of the sensors or the outputs is wrong, or that a person wanted the end: the outputs stay in the
-safe state until a person acts.
+safe state until a person acts. A hold begins only in the state RUNNING; ``Incidents.report`` says what a recoverable
+finding does in the other states.
 Models: ArduPilot's failsafe actions, IEC 61800-5-2 (a stop that holds against one that removes power), the fault
 protection of F Prime. ``docs/findings.md`` is this table, made by ``python -m tools.research.reports.findings_page``.
 """
@@ -339,7 +340,7 @@ class Finding(Enum):
     )
 
 
-def finding_of_scans(error: HalError, stall_ms: float) -> Finding:
+def classify_scan_error(error: HalError, stall_ms: float) -> Finding:
     """Return the finding for an error of reading scans. ``stall_ms`` is how long this host has just stood still (ms),
     0 if it has not."""
     match error:
@@ -355,7 +356,7 @@ def finding_of_scans(error: HalError, stall_ms: float) -> Finding:
             return Finding.DAQ_FAILED
 
 
-def finding_of_sensor(error: HalError) -> Finding:
+def classify_sensor_error(error: HalError) -> Finding:
     """Return the finding for an error of reading a sensor that has no scans."""
     match error:
         case Disconnected():
@@ -366,12 +367,12 @@ def finding_of_sensor(error: HalError) -> Finding:
             return Finding.SENSOR_FAILED
 
 
-def finding_of_button(error: HalError) -> Finding:
+def classify_button_error(error: HalError) -> Finding:
     """Return the finding for an error of the stop button's bus."""
     return Finding.BUTTON_GONE if isinstance(error, Disconnected) else Finding.BUTTON_BUS
 
 
-def finding_of_output(error: HalError) -> Finding:
+def classify_output_error(error: HalError) -> Finding:
     """Return the finding for an error of a command or a read-back. An error that contradicts a command is never taken
     for a lost transfer."""
     match error:

@@ -15,14 +15,14 @@ OPERATOR = "the operator"
 
 
 class Holds:
-    """Counts holds and decides when one may end. ``waits_for`` says in words what the hold waits for.
+    """Counts holds and decides when one may end. ``waits_for`` is a text for display: what the hold waits for.
 
-    ``spares_host``: a hold that this host has caused does not count towards ``holds_per_minute``.
+    ``allows_host_stalls``: a hold that this host has caused does not count towards ``holds_per_minute``.
     """
 
-    def __init__(self, limits: SafetyLimits, supervisor: Supervisor, *, spares_host: bool = False) -> None:
+    def __init__(self, limits: SafetyLimits, supervisor: Supervisor, *, allows_host_stalls: bool = False) -> None:
         self.waits_for = ""
-        self._spares_host = spares_host
+        self._spares_host = allows_host_stalls
         self._limits = limits
         self._supervisor = supervisor
         self._good_since_ns = 0
@@ -36,7 +36,7 @@ class Holds:
         """Return the hold that lasts now, or ``None``."""
         return self._supervisor.holds[-1] if self._supervisor.is_holding else None
 
-    def within_a_minute(self, now_ns: int) -> int:
+    def count_within_a_minute(self, now_ns: int) -> int:
         """Return the number of holds that began within the last minute and count."""
         return sum(now_ns - hold.t_ns < MINUTE_NS for hold in self._supervisor.holds if self.counts(hold.cause))
 
@@ -45,7 +45,7 @@ class Holds:
         return cause is not CauseClass.HOST or not self._spares_host
 
     def interrupt(self, now_ns: int, why: str) -> None:
-        """Restart the time that must be good without interruption, because of ``why``."""
+        """Restart the time that must be good without interruption; ``why`` is what the hold waits for."""
         self._good_since_ns, self.waits_for = now_ns, why
         self._is_ready = self._asked = False
 
@@ -68,11 +68,12 @@ class Holds:
         return self._is_ready
 
     def ask(self) -> bool:
-        """Take the operator's request to move again. Return False, and forget the request, if no hold can end yet."""
+        """Accept the operator's request to end the hold. Return False, and drop the request, if the hold cannot end yet
+        (``may_end``)."""
         self._asked = self._is_ready and self._supervisor.state is State.HOLD
         return self._asked
 
-    def wait_out_host(self, now_ns: int, reason: str) -> None:
+    def exclude_host_stall(self, now_ns: int, reason: str) -> None:
         """Exclude a stall of the host within a hold from the hold's time limit. A hold that the host caused takes
         ``reason`` as its own."""
         self._last_ready_ns, self._refused = now_ns, None
@@ -93,7 +94,7 @@ class Holds:
         if self._refused is None or self._refused[0] is not hold:
             self._refused = hold, now_ns
 
-    def is_too_long(self, now_ns: int) -> bool:
+    def has_timed_out(self, now_ns: int) -> bool:
         """Return True if the hold has not become good within ``hold_limit_ms``, or has not been able to end for as long
         because the outputs could not be armed."""
         hold = self.current

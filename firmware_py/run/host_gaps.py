@@ -13,9 +13,8 @@ class HostGaps:
         self._last_ms = 0.0
         self._last_ns: int | None = None
 
-    def look(self, due_ns: int, now_ns: int) -> None:
-        """Note that the loop was to be awake at ``due_ns`` and is awake at ``now_ns``. An emulated world may report its
-        own gaps."""
+    def record(self, due_ns: int, now_ns: int) -> None:
+        """Record that the loop was due at ``due_ns`` and ran at ``now_ns``. An emulated world records gaps likewise."""
         late_ms = (now_ns - due_ns) * 1e-6
         if late_ms < self._limit_ms:
             return

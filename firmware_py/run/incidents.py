@@ -17,7 +17,8 @@ from hal.errors import HalError
 
 
 class Recorder(Protocol):
-    """Receives finished frames and events. It never blocks, and counts what it drops."""
+    """Receives finished frames and events without blocking. Both methods return False for a row or event that is
+    dropped for want of room, and count it."""
 
     def push(self, row: NDArray[np.float64]) -> bool: ...
     def event(self, event: dict[str, object]) -> bool: ...
@@ -29,9 +30,9 @@ class LoopCounts:
 
     ``lost``: scans known to be missing; ``unread``: scans that were due after the last one read, when the loop stopped.
     ``commands``: commands sent to the amplifier; ``superseded``: ticks whose values a slow amplifier passed over for
-    newer ones. ``clipped``: ticks whose command ran into a limit (yielding does not count). ``latency``: time from
-    sample to command of the commands sent. ``noticed``: bench time (ns) at which a condition that does not end a run
-    was first seen.
+    newer ones. ``clipped``: ticks whose command ran into a limit (yielding does not count). ``latency``: time from the
+    sample (its due time) to the end of ``write``, of the commands sent. ``noticed``: bench time (ns) at which a
+    condition that does not end a run was first seen.
     """
 
     expected: int = 0
@@ -47,8 +48,8 @@ class LoopCounts:
 
 
 class Incidents:
-    """Turns every finding into the consequence that ``findings.Finding`` states. The loop keeps ``tick``; ``error`` is
-    the first hardware error that ended a run."""
+    """Turns every finding into the consequence that ``findings.Finding`` states. The loop sets ``tick``, the number of
+    the tick under way; ``error`` is the first hardware error that ended the run."""
 
     def __init__(
         self,
@@ -58,7 +59,7 @@ class Incidents:
         recorder: Recorder | None,
         limits: SafetyLimits | None = None,
         *,
-        spares_host: bool = False,
+        allows_host_stalls: bool = False,
     ) -> None:
         self._limits = limits or SafetyLimits()
         self._supervisor = supervisor
@@ -66,12 +67,12 @@ class Incidents:
         self._clock = clock
         self._recorder = recorder
         self._bad_since: dict[Finding, int] = {}
-        self.holds = Holds(self._limits, supervisor, spares_host=spares_host)
+        self.holds = Holds(self._limits, supervisor, allows_host_stalls=allows_host_stalls)
         self.tick = -1
         self.error: HalError | None = None
 
     def note(self, event: dict[str, object]) -> None:
-        """Write ``event`` into the recording, with time and tick."""
+        """Write ``event`` into the recording, with the bench time (``t_ns``) and the tick."""
         if self._recorder is not None:
             self._recorder.event({"t_ns": self._clock.now_ns(), "tick": self.tick, **event})
 
@@ -80,25 +81,39 @@ class Incidents:
         self._counts.noticed.setdefault(what, self._clock.now_ns())
 
     def report(self, finding: Finding, **words: object) -> None:
-        """Do what the table says: hold, or decide for the safe state. ``words`` fill the finding's message."""
+        """Start the consequence of ``finding``; ``words`` fill the fields of its message.
+
+        A latched finding ends the run: the outputs ramp to the safe state and stay there. A recoverable one depends on
+        the supervisor's state:
+
+        - RUNNING: the outputs ramp to neutral and hold. The run ends instead if this is one hold more within a minute
+          than ``holds_per_minute``.
+        - SELF_TEST, HOLD_RAMP, HOLD: the self-test or hold goes on, and the time that must be good without
+          interruption begins again. The finding is counted in ``LoopCounts.noticed``.
+        - BOOT, SENSING_ONLY: the run ends, as with a latched finding. Readings are reported by ``report_reading`` and
+          ``report_after``, which only notice them there.
+        - SAFE_RAMP, SAFE: nothing happens, and a latched finding changes nothing either: the first reason wins.
+        """
         self._answer(finding, finding.value.says.format(**words))
 
-    def doubt(self, finding: Finding, **words: object) -> None:
-        """Report a reading that nothing may be moved by; where nothing is armed, it is noticed only."""
+    def report_reading(self, finding: Finding, **words: object) -> None:
+        """Report a reading that must not move the outputs. In the state SENSING_ONLY it is only noticed."""
         if self._supervisor.state is State.SENSING_ONLY:
             self.notice(finding.value.title)
         else:
             self.report(finding, **words)
 
     def report_error(self, finding: Finding, device: str, error: HalError, **words: object) -> None:
-        """Report ``error`` with the bench's name of the device in front: a port knows only its path."""
+        """Report ``error`` with the bench's name of ``device`` in front, because a port knows only its path. Keep it in
+        ``error`` if it ended the run."""
         text = f"{error}" if str(error).startswith(device) else f"{device}: {error}"
         self.report(finding, error=text, **words)
         if self._supervisor.trip_cause is not None and self.error is None:
             self.error = error
 
-    def bad_for(self, finding: Finding, bad: bool, t_ns: int, patience_ms: float, **words: object) -> None:
-        """Report ``finding`` when ``bad`` has held for ``patience_ms``; where nothing is armed, notice it only."""
+    def report_after(self, finding: Finding, bad: bool, t_ns: int, patience_ms: float, **words: object) -> None:
+        """Report ``finding`` once ``bad`` has been True for ``patience_ms``, in every further call as well. ``t_ns`` is
+        the time of the reading (bench clock). In the state SENSING_ONLY the finding is only noticed."""
         if not bad:
             if self._bad_since:
                 self._bad_since.pop(finding, None)
@@ -118,12 +133,12 @@ class Incidents:
             self.holds.interrupt(now_ns, reason)
             self.notice(finding.value.title)
             if finding is Finding.HOST_OVERSLEPT:
-                self.holds.wait_out_host(now_ns, reason)
+                self.holds.exclude_host_stall(now_ns, reason)
         elif supervisor.state is not State.RUNNING or self._limits.holds_per_minute == 0:
             self._trip(finding, reason)
         elif (
             self.holds.counts(finding.value.cause)
-            and (count := self.holds.within_a_minute(now_ns) + 1) > self._limits.holds_per_minute
+            and (count := self.holds.count_within_a_minute(now_ns) + 1) > self._limits.holds_per_minute
         ):
             text = Finding.TOO_MANY_HOLDS.value.says.format(
                 count=count, limit=self._limits.holds_per_minute, what=reason
@@ -135,7 +150,7 @@ class Incidents:
             cause = finding.value.cause.value
             self.note({"event": "hold begins", "reason": reason, "finding": finding.name.lower(), "class": cause})
 
-    def give_hold_up(self) -> None:
+    def abandon_hold(self) -> None:
         """End the run because the hold has lasted too long."""
         hold = self.holds.current
         if hold is None:

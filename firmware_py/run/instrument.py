@@ -29,8 +29,8 @@ class InstrumentPlan(Protocol):
 
 
 class OpenedInstrument(Protocol):
-    """Defines an instrument whose devices are configured and not yet running. ``identities`` is what each probe found,
-    ``output`` moves the actuators, ``columns`` are names and units of the rows that are recorded."""
+    """Defines an instrument whose devices are configured and not yet running. ``identities`` are the answers of the
+    probes by device, ``output`` moves the actuators, ``columns`` are names and units of the rows that are recorded."""
 
     @property
     def identities(self) -> dict[str, str]: ...
@@ -65,7 +65,7 @@ class Instrument(Protocol):
     def closers(self) -> Sequence[Callable[[], object]]: ...
 
     def prepare(self) -> None:
-        """Do what needs ``Run.scheduler`` and takes long; called once before real-time settings are made."""
+        """Prepare what needs ``Run.scheduler`` or takes long; called once, before real-time settings are made."""
         ...
 
     def running(self) -> AbstractContextManager[object]:
@@ -77,19 +77,20 @@ class Instrument(Protocol):
         ...
 
     def wait(self) -> Ticks | None:
-        """Return the next ticks, or ``None`` where the loop must not wait any more."""
+        """Wait for the next ticks and return them. Return ``None`` if the supervisor must not wait any more
+        (``must_not_wait``). Raises ``HalError`` if a read fails and has ended the run."""
         ...
 
     def poll(self) -> Ticks | None:
         """Return the ticks that have become due, without waiting; called while the outputs are being armed."""
         ...
 
-    def look_at(self, ticks: Ticks) -> None:
-        """Report what the arrival of ``ticks`` reveals, before their tasks run."""
+    def inspect_ticks(self, ticks: Ticks) -> None:
+        """Report findings about the arrival of ``ticks`` (late, missing, without scan), before their tasks run."""
         ...
 
     def rest(self) -> None:
-        """Do what only a hold allows; called once per pass of the loop while one lasts."""
+        """Do the work that is allowed only during a hold; called once per pass of the loop while one lasts."""
         ...
 
     def repair(self) -> None:

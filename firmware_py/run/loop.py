@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Generator
 
 from firmware_py.run.context import Run
-from firmware_py.run.findings import Finding, finding_of_output
+from firmware_py.run.findings import Finding, classify_output_error
 from firmware_py.run.instrument import Instrument
 from firmware_py.run.safety import State
-from firmware_py.run.status import histograms_of, numbers_of
+from firmware_py.run.status import collect_histograms, collect_numbers
 from firmware_py.run.tasks import bind_tasks
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.scheduler import Scheduler
@@ -20,11 +20,12 @@ from firmware_py.scheduler.task import BackgroundSpec
 from hal.contracts import ARMING_STEP_S
 from hal.errors import HalError
 
-SETTLE_TICKS = 5  # covers the amplifier's own lag after the last step of the ramp
+SETTLE_TICKS = 5
+"""Ticks that the loop waits after the last ramp step, so that the amplifier reaches neutral."""
 LONGEST_PAUSE_NS = 10_000_000
 """Longest pause between two attempts at a ramp step over a failing bus. The pauses double up to this value."""
 HOST_PATIENCE = 10.0
-"""The self-test may take so many times longer on a host that stands still now and then."""
+"""Factor by which the self-test may take longer on a host that stands still again and again."""
 STATUS_PERIOD_NS = 200_000_000
 
 
@@ -53,7 +54,7 @@ class Loop:
 
     def histograms(self) -> dict[str, DurationHistogram]:
         """Return every live histogram by its name on the page."""
-        return histograms_of(self._run, self._instrument.histograms())
+        return collect_histograms(self._run, self._instrument.histograms())
 
     def run(self, seconds: float) -> None:
         """Run the self-test, arm, run for ``seconds`` after arming, ramp to neutral. Always ends in the safe state.
@@ -74,7 +75,7 @@ class Loop:
                 raise
             finally:
                 finish_ramp(self._run)
-                self._tell_end()
+                self._report_end()
                 self._close()
 
     def _start(self, seconds: float) -> None:
@@ -97,7 +98,7 @@ class Loop:
             run.ticks = ticks
             run.incidents.tick = ticks.k0
             newest_ns = ticks.due_ns + (ticks.n - 1) * ticks.dt_ns
-            instrument.look_at(ticks)
+            instrument.inspect_ticks(ticks)
             if run.signals.interrupted:
                 run.incidents.report(Finding.STOPPED, signal=run.signals.interrupted)
             elif run.end_ns is not None and newest_ns >= run.end_ns and self._may_finish():
@@ -107,11 +108,11 @@ class Loop:
             if supervisor.is_safe:  # there are no outputs whose ramp the tasks would run
                 break
             run.scheduler.run(ticks)
-            run.host_gaps.look(awake_ns + run.period_ns, run.clock.now_ns())
+            run.host_gaps.record(awake_ns + run.period_ns, run.clock.now_ns())
             if supervisor.state is State.SELF_TEST and self._self_test_passed():
                 self._arm(seconds)
             elif supervisor.is_holding:
-                self._look_after_hold()
+                self._update_hold()
             run.scheduler.run_slack(newest_ns + ticks.dt_ns + run.period_ns)
 
     # -- arming and holds ---------------------------------------------------------------------------------
@@ -155,8 +156,9 @@ class Loop:
             run.end_ns = run.armed_ns + round(seconds * 1e9)
 
     def _pass_arming_step(self) -> None:
-        """Let the time after a step of arming pass. Scans that come meanwhile are not kept waiting: the DAQ has little
-        room for them, and a node that was armed does not wait for a loop that catches up."""
+        """Wait for ``ARMING_STEP_S`` after a step of arming, and run the ``catch_up`` tasks for scans that have come.
+        They cannot be left for later: the DAQ buffers few scans, and an armed node must get its next command in time.
+        """
         run = self._run
         until_ns = run.clock.now_ns() + round(ARMING_STEP_S * 1e9)
         if (ticks := self._instrument.poll()) is not None:
@@ -167,15 +169,15 @@ class Loop:
 
     @property
     def _output_name(self) -> str:
-        """Return the output's name for an error: the port that failed does not know whose it is."""
+        """Return the output's name in the bench file for an error, because a port knows only its path."""
         return self._run.output.name if self._run.output is not None else ""
 
     def _may_finish(self) -> bool:
-        """Return False within a hold whose cause has not passed: an end of the run there would hide the cause."""
+        """Return False in a hold whose cause has not passed, because "run finished" would hide the cause."""
         return not self._run.supervisor.is_holding or self._run.incidents.holds.is_ready
 
-    def _look_after_hold(self) -> None:
-        """End the hold, wait, or give it up, while the outputs are on their way to neutral or there."""
+    def _update_hold(self) -> None:
+        """End the hold, wait, or abandon it; called once per pass while the outputs ramp to neutral or rest there."""
         run, holds = self._run, self._run.incidents.holds
         now_ns = run.clock.now_ns()
         self._instrument.rest()
@@ -191,8 +193,8 @@ class Loop:
             holds.ask()
         if holds.may_end(now_ns):
             self._resume()
-        elif holds.is_too_long(now_ns):
-            run.incidents.give_hold_up()
+        elif holds.has_timed_out(now_ns):
+            run.incidents.abandon_hold()
 
     def _resume(self) -> None:
         run = self._run
@@ -200,7 +202,7 @@ class Loop:
         try:
             run.supervisor.resume(self._pass_arming_step)
         except HalError as error:
-            run.incidents.report_error(finding_of_output(error), self._output_name, error)
+            run.incidents.report_error(classify_output_error(error), self._output_name, error)
             run.incidents.holds.note_refusal(run.clock.now_ns())
             return
         if run.supervisor.may_move:
@@ -208,7 +210,7 @@ class Loop:
 
     # -- the end ------------------------------------------------------------------------------------------
 
-    def _tell_end(self) -> None:
+    def _report_end(self) -> None:
         """Report the safe state to the bench page before the run's outcome is there."""
         run, trip = self._run, self._run.supervisor.trip_cause
         if run.live is not None and run.on_status is not None and trip is not None:
@@ -242,12 +244,12 @@ class Loop:
             k = run.ticks.k0 if run.ticks is not None else 0
             if k >= next_k:
                 next_k = k + every
-                run.on_status({**numbers_of(run), **self._instrument.numbers()})
+                run.on_status({**collect_numbers(run), **self._instrument.numbers()})
             yield False
 
 
 def finish_ramp(run: Run) -> None:
-    """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle.
+    """Finish the ramp on the host clock, because the scans may have stopped, and let the outputs settle.
 
     A ramp step that fails is tried again for ``[firmware.safety] neutral_retry_s``, with pauses that double up to
     ``LONGEST_PAUSE_NS``. Another SIGINT or SIGTERM during the retries gives the ramp up; neutral is then not confirmed.

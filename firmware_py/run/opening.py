@@ -8,7 +8,7 @@ from hal.errors import HalError, OpenFailed
 
 
 class Probes:
-    """Collects what each device says of itself in ``identities``, and the errors of those that do not answer."""
+    """Collects the answers of the devices' probes in ``identities``, and the errors of those that do not answer."""
 
     def __init__(self) -> None:
         self.identities: dict[str, str] = {}

@@ -1,5 +1,5 @@
-"""Obeys the bench page's orders to a running loop: the safe state and the end of a hold for every instrument, others
-for the instrument that knows them."""
+"""Handles the bench page's orders to a running loop: the safe state and the end of a hold for every instrument, other
+orders by the instrument that defines them."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from firmware_py.run.findings import Finding
 
 
 class PageOrders:
-    """Obeys the orders that have arrived. ``obey_own(order, now_ns)`` gets the orders that not every instrument has,
-    and drops invalid ones. ``host_ns`` is the clock of the page's time stamps."""
+    """Handles the orders that have arrived. ``handle_own(order, now_ns)`` gets the instrument's own orders with the
+    bench time (ns), and drops invalid ones. ``host_ns`` is the clock of the page's time stamps, ``CLOCK_MONOTONIC``."""
 
     def __init__(
         self,
         run: Run,
-        obey_own: Callable[[Mapping[str, Any], int], None],
+        handle_own: Callable[[Mapping[str, Any], int], None],
         host_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._run = run
-        self._obey_own = obey_own
+        self._handle_own = handle_own
         self._host_ns = host_ns
 
-    def obey_all(self) -> None:
-        """Obey every order that has arrived since the last call. Has no effect without a page."""
+    def handle_orders(self) -> None:
+        """Handle every order that has arrived since the last call. Has no effect without a page."""
         if self._run.live is not None:
             for order in self._run.live.orders():
-                self._obey(order)
+                self._handle(order)
 
-    def _obey(self, order: Mapping[str, Any]) -> None:
+    def _handle(self, order: Mapping[str, Any]) -> None:
         run, incidents = self._run, self._run.incidents
         now_ns = run.clock.now_ns()
         match order:
@@ -45,4 +45,4 @@ class PageOrders:
                 if not incidents.holds.ask():
                     incidents.note({"event": "rearm refused", "reason": incidents.holds.waits_for})
             case _:
-                self._obey_own(order, now_ns)
+                self._handle_own(order, now_ns)

@@ -55,7 +55,8 @@ class Ending:
 def make_outcome(
     request: RunRequest, opened: OpenBench, run: Run, identities: Mapping[str, str], ending: Ending
 ) -> dict[str, Any]:
-    """Return the part of the run's JSON that every instrument has. ``identities``: what each device said of itself."""
+    """Return the part of the run's JSON that every instrument has. ``identities``: the answers of the devices'
+    probes. Times ending in ``_ns`` are on the bench clock."""
     snapshot = run.scheduler.snapshot()
     supervisor, counts, recording = run.supervisor, run.counts, ending.recording
     trip = supervisor.trip_cause

@@ -22,7 +22,8 @@ from hal.errors import HalError, I2cNack
 from hal.validation import StrictTable
 
 RAMP_TICKS = 20
-"""Ticks from the decision to neutral: 20 ms. The amplifier's own ramp is shorter, so that steps can be retried."""
+"""Ticks from the decision to neutral, 20 ms at 1 kHz. The driver's ramp is shorter (``drivers.output_guard_steps``:
+``RAMP_STEPS`` of 1 ms each), so that steps can be retried."""
 ATTEMPTS = 3
 """Largest number of attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of a transfer's time."""
 
@@ -51,20 +52,19 @@ Supply_V = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 class SafetyLimits(StrictTable):
-    """Sets the limits beyond which the outputs leave normal operation.
+    """Sets the limits beyond which the outputs leave normal operation: ``[firmware.safety]``. Times are bench time.
 
-    ``stale_ms``: the DAQ may be silent for so long. ``temperature_C`` and ``supply_V``: the lowest and the highest
-    reading. ``saturated_ms``: an axis may stay at its limit for so long.
-    ``stalled_ms``: scans that come in one piece after so long say that the host stood still, uncontrolled.
-    ``magnetometer_ms``: the heading may coast for so long; a rate that is integrated from accelerations does not keep
-    it for longer.
-    ``monitor_ms``: the amplifier's monitor may be silent for so long.
-    ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
-    ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
-    ``neutral_retry_s``: how long firmware and guardian try to reach neutral over a bus that fails; then they give up.
-    ``hold_ms``: after a recoverable finding, scans and self-test must have been good for so long without interruption
-    before the outputs move again. ``hold_limit_ms``: a hold that has not become good for so long ends the run.
-    ``holds_per_minute``: one more within a minute ends the run; with 0 every finding does.
+    ``stale_ms``: longest time without a scan. ``temperature_C`` and ``supply_V``: lowest and highest reading.
+    ``saturated_ms``: longest time for which an axis may stay at its limit.
+    ``stalled_ms``: scans that come at once after this time say that the host stood still without control.
+    ``magnetometer_ms``: longest time without a field; a heading that is integrated from accelerations drifts.
+    ``monitor_ms``: longest time without a reading of the amplifier's monitor.
+    ``guardian``: a second process takes the outputs to neutral when this one dies, or sends no command for
+    ``guardian_ms``, or for twice ``stale_ms`` if that is longer; it notes a pause of ``guardian_notice_ms``.
+    ``neutral_retry_s``: time for which firmware and guardian retry a ramp over a bus that fails; then they give up.
+    ``hold_ms``: time for which scans and self-test must have been good without interruption after a recoverable
+    finding before the outputs move again. ``hold_limit_ms``: a hold that has not become good in this time ends the run.
+    ``holds_per_minute``: number of holds allowed within a minute; one more ends the run, and with 0 every finding does.
     ``rearm``: who ends a hold whose cause has passed, the firmware or a person (button of the page, key, SIGUSR1).
     """
 
@@ -104,7 +104,8 @@ class SelfTestLimits(StrictTable):
 
 @dataclass(frozen=True)
 class Trip:
-    """Records why and when the outputs were taken to their safe state. ``cause``: class of the cause."""
+    """Records why and when the outputs were taken to their safe state. ``tick``: number of the tick under way;
+    ``t_ns``: time of the decision (bench clock); ``cause``: class of the cause."""
 
     finding: Finding
     reason: str
@@ -120,8 +121,8 @@ class Trip:
 
 @dataclass
 class Hold:
-    """Records one hold. ``t_ns``: time of the decision, bench clock; ``end_ns``: time at which the outputs were free
-    again or the run was ended, ``None`` while the hold lasts. ``neutral_ns``: time at which neutral was reached."""
+    """Records one hold. ``t_ns``: time of the decision, bench clock; ``end_ns``: time at which the outputs could move
+    again or the run ended, ``None`` while the hold lasts. ``neutral_ns``: time at which neutral was reached."""
 
     finding: Finding
     reason: str
@@ -134,8 +135,8 @@ class Hold:
 
 
 class Supervisor:
-    """Owns the permission to move. ``output`` is the only thing it touches; an instrument without outputs (``None``) is
-    at neutral at once."""
+    """Owns the permission to move. It arms and ramps ``output`` and uses no other device; an instrument without outputs
+    (``None``) is at neutral at once."""
 
     def __init__(self, output: AnalogOutput | None) -> None:
         self._output = output
@@ -220,7 +221,7 @@ class Supervisor:
         if meanwhile is not None and isinstance(output, ArmsInSteps):
             for _ in output.arming():
                 meanwhile()
-                if self.state is not state:  # something was found in the meantime
+                if self.state is not state:  # a finding has changed the state meanwhile
                     return
         elif output is not None:
             output.arm()
@@ -269,10 +270,10 @@ class Supervisor:
             self.safe_reached = self.state is State.SAFE_RAMP
             self.state = State.SAFE if self.safe_reached else State.HOLD
         elif self._ramp_ticks >= 2 * RAMP_TICKS:
-            self._be_late(may_retry)
+            self._handle_late_ramp(may_retry)
         return self.state is State.SAFE
 
-    def _be_late(self, may_retry: bool) -> None:
+    def _handle_late_ramp(self, may_retry: bool) -> None:
         """Handle a ramp that did not confirm neutral in time. A hold needs neutral, so its reason ends the run."""
         self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
         if self.state is State.HOLD_RAMP:

@@ -34,13 +34,14 @@ def run_plan(
 ) -> tuple[Instrument, dict[str, Any]]:
     """Run ``plan`` on the opened bench. Return the instrument as it ended, and the outcome as JSON values.
 
-    Raises ``HalError`` when the devices cannot be opened; what goes wrong later is in the outcome's ``safe_state``.
-    ``injector`` has put faults around the ports. ``own_process``: this process is the firmware and nothing else.
+    Raises ``HalError`` if the devices cannot be opened; later failures are in the outcome's ``safe_state``.
+    ``injector`` has put faults around the ports. ``own_process``: this process is the firmware and nothing else, so the
+    guardian may kill it.
     """
     with contextlib.ExitStack() as stack:
         parts = plan.open(opened)
-        limits = limits_of(plan.safety, request)
-        output = stack.enter_context(guarded(opened, parts.output, limits, may_end_us=own_process))
+        limits = apply_overrides(plan.safety, request)
+        output = stack.enter_context(guarded(opened, parts.output, limits, may_be_killed=own_process))
         metadata = recording_metadata(plan.bench, parts, opened)
         recorder = None
         if request.record is not None:
@@ -53,17 +54,17 @@ def run_plan(
             recorder=recorder,
             live=_open_link(request, opened, metadata, stack),
             on_status=on_status,
-            guardian=output.care,
+            guardian=output.lifecycle,
             sense_only=request.sense_only,
-            others_stalled_ms=opened.world.stalled_ms if opened.world is not None else None,
-            spares_host=isinstance(opened.clock, MonotonicClock) and is_emulated(opened.file.description),
+            other_stall_ms=opened.world.stalled_ms if opened.world is not None else None,
+            allows_host_stalls=isinstance(opened.clock, MonotonicClock) and is_emulated(opened.file.description),
         )
         machine, summary, scheduled = describe_machine(opened), None, dict[str, Any]()
         interrupts = stack.enter_context(count_interrupts()) if own_process else lambda: 0
         try:
             instrument = parts.assemble(run)
             loop = Loop(run, instrument)
-            _tell_devices(run, loop, parts)
+            _report_devices(run, loop, parts)
             try:
                 with scheduling(request, opened) as report:
                     wall_s, cpu_s = time.monotonic(), time.process_time()
@@ -74,14 +75,14 @@ def run_plan(
         finally:
             if recorder is not None:
                 summary = recorder.stop(scheduled)
-        last_word: Mapping[str, Any] = {}
-        if output.care is not None and output.heart is not None:
-            if output.heart.noticed_ns:
-                run.counts.noticed.setdefault("no command for a while (guardian)", output.heart.noticed_ns)
-            # before the emulated world ends: the guardian may still have something to do
+        takeover: Mapping[str, Any] = {}
+        if output.lifecycle is not None:
+            if late_ns := output.lifecycle.heartbeat.late_beat_ns:
+                run.counts.noticed.setdefault("no command for a while (guardian)", late_ns)
+            # before the emulated world ends, because the guardian may still have to ramp the outputs
             so_far = interrupts()
-            last_word = output.care.finish(hurry=lambda: interrupts() > so_far)
-        outcome = make_outcome(request, opened, run, parts.identities, Ending(report, summary, last_word))
+            takeover = output.lifecycle.stop(is_interrupted=lambda: interrupts() > so_far)
+        outcome = make_outcome(request, opened, run, parts.identities, Ending(report, summary, takeover))
         outcome |= instrument.report()
         outcome["host"] = describe_host(opened, run.host_gaps, cpu_share)
         outcome["machine"] = machine
@@ -102,7 +103,7 @@ def _open_link(
     return live
 
 
-def _tell_devices(run: Run, loop: Loop, parts: OpenedInstrument) -> None:
+def _report_devices(run: Run, loop: Loop, parts: OpenedInstrument) -> None:
     """Tell the page which devices there are, and the names of the histograms in its memory."""
     if run.on_status is not None and run.live is not None:
         run.on_status(
@@ -115,7 +116,7 @@ def _tell_devices(run: Run, loop: Loop, parts: OpenedInstrument) -> None:
         )
 
 
-def limits_of(limits: SafetyLimits, request: RunRequest) -> SafetyLimits:
+def apply_overrides(limits: SafetyLimits, request: RunRequest) -> SafetyLimits:
     """Return the limits of the bench file with what the request overrides."""
     if request.stale_ms is None:
         return limits

@@ -8,8 +8,8 @@ from collections.abc import Generator
 
 
 class Signals:
-    """Remembers the signals that have come. ``interrupted`` is the name of the last SIGINT or SIGTERM, ``interrupts``
-    their number, ``rearm_asked`` is set by SIGUSR1 until somebody clears it."""
+    """Keeps the signals that have come. ``interrupted`` is the name of the last SIGINT or SIGTERM, ``interrupts`` their
+    number. SIGUSR1 sets ``rearm_asked``; the loop clears it at neutral, where a hold that cannot end yet drops it."""
 
     def __init__(self) -> None:
         self.interrupted = ""
@@ -18,11 +18,11 @@ class Signals:
 
     @contextlib.contextmanager
     def caught(self) -> Generator[None]:
-        """Catch the signals within the block, where they can be had: in the main thread."""
+        """Catch the signals within the block. Has no effect outside the main thread, which alone can catch them."""
         handlers = {signal.SIGINT: self._interrupt, signal.SIGTERM: self._interrupt, signal.SIGUSR1: self._rearm}
         try:
             previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-        except ValueError:  # not the main thread: whoever started the loop there handles signals
+        except ValueError:  # not the main thread, which alone can handle signals
             previous = {}
         try:
             yield

@@ -6,7 +6,7 @@ from firmware_py.run.context import Run
 from firmware_py.scheduler.histogram import DurationHistogram
 
 
-def numbers_of(run: Run) -> dict[str, object]:
+def collect_numbers(run: Run) -> dict[str, object]:
     """Return the status as JSON values, under the names of the bench page. ``t_s`` counts from the start of the run."""
     now_ns, supervisor, counts = run.clock.now_ns(), run.supervisor, run.counts
     latency = counts.latency.distribution()
@@ -34,6 +34,6 @@ def _page_numbers(run: Run, now_ns: int) -> dict[str, object]:
     }
 
 
-def histograms_of(run: Run, own: dict[str, DurationHistogram]) -> dict[str, DurationHistogram]:
+def collect_histograms(run: Run, own: dict[str, DurationHistogram]) -> dict[str, DurationHistogram]:
     """Return every live histogram, those of the instrument (``own``) first."""
     return {**own, **run.scheduler.histograms()}

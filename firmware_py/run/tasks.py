@@ -19,7 +19,8 @@ from firmware_py.scheduler.check import MAX_HYPERPERIOD_TICKS
 from firmware_py.scheduler.task import TaskSpec, TickInfo
 from hal.errors import BenchError
 
-LONGEST_US = 1e5  # the period of the slowest tick
+LONGEST_US = 1e5
+"""Largest budget: the period of the slowest tick rate, 10 Hz."""
 EVERY_TICK = Polls(1)
 
 Work = Callable[[TickInfo], object]
@@ -30,9 +31,9 @@ class TaskRow:
     """Describes a task of an instrument.
 
     ``rate``: ``Polls(10)`` runs the task in every 10th tick, ``Polls(10, 3)`` three times in 10 ticks; ``None`` means
-    that this bench has no device for the task. ``phase``: tick that is tried first. ``budget_us``: longest run it
-    promises. ``deferrable``: ticks in a row for which it may be put off. ``catch_up``: runs for every scan of a block
-    that arrived late. ``deadline_ticks``: periods after which a run counts as late.
+    that this bench has no device for the task. ``phase``: tick that is tried first. ``budget_us``: longest run that the
+    task promises. ``deferrable``: number of ticks in a row for which it may be deferred. ``catch_up``: it runs for
+    every scan of a block that arrived late. ``deadline_ticks``: tick periods after which a run counts as late.
 
     If ``work`` raises, the run ends: the rest of the tick's tasks are skipped and the outputs ramp to neutral
     (``Loop.run``). A task that can go on catches its ``HalError`` and reports a ``Finding``.
@@ -67,7 +68,7 @@ def bind_tasks(rows: Sequence[TaskRow], tick_hz: int, budget_us: Mapping[str, fl
         if rate is None:
             continue
         budget = budget_us.get(row.name, row.budget_us)
-        for k, tick in enumerate(_emptiest(load_us, rate, row.phase)):
+        for k, tick in enumerate(_find_emptiest_ticks(load_us, rate, row.phase)):
             load_us[tick :: rate.divider] += budget
             name = row.name if rate.count == 1 else f"{row.name}_{k + 1}"
             deadline_us = row.deadline_ticks * period_us
@@ -97,7 +98,7 @@ def _hyperperiod(rates: list[Polls]) -> int:
     return ticks
 
 
-def _emptiest(load_us: NDArray[np.float64], rate: Polls, start: int) -> tuple[int, ...]:
+def _find_emptiest_ticks(load_us: NDArray[np.float64], rate: Polls, start: int) -> tuple[int, ...]:
     """Return the ticks for ``rate`` that carry the smallest load; of equal ones the first from ``start`` on."""
 
     def fullest(first: int) -> float:

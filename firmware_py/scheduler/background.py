@@ -1,7 +1,7 @@
 """Runs background tasks: generators that run in the slack between ticks, one declared step at a time.
 
-A loop without slack would show nothing, just when something is to be seen: what has waited for ``PATIENCE_NS`` takes
-one step all the same, and the tick after it comes late.
+In a loop without slack a task that has waited for ``PATIENCE_NS`` runs one step nevertheless, so that the page still
+shows the loop; the tick after it comes late.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from firmware_py.scheduler.statistics import BackgroundSnapshot
 from firmware_py.scheduler.task import BackgroundSpec
 
 PATIENCE_NS = 500_000_000
+"""Longest time for which a background task waits for slack."""
 
 
 class _LiveBackground:
@@ -43,11 +44,11 @@ class Slack:
         self._turn = 0
 
     def run(self, until_ns: int, tick: int) -> int:
-        """Run steps that end before ``until_ns`` if they keep their promise, and one of each task that has waited for
-        ``PATIENCE_NS``; return how many ran.
+        """Run steps that end before ``until_ns`` if none exceeds its declared length, and one step of each task that
+        has waited for ``PATIENCE_NS``. Return the number of steps.
 
-        A task that yields False (nothing to do) is left alone until the next call; one that returns is
-        finished; one that raises is marked, finished, and its exception goes on to the caller.
+        A task that yields False (nothing to do) is not run again before the next call; one that returns is
+        finished; one that raises is marked and finished, and its exception is raised here.
         """
         waiting = [task for task in self._live[self._turn :] + self._live[: self._turn] if not task.finished]
         steps = 0

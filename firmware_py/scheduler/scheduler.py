@@ -88,7 +88,7 @@ class _Ignored:
 
 
 class Scheduler:
-    """Runs a checked task table; ``tick`` and ``catch_up`` are called by whoever owns the time base.
+    """Runs a checked task table; the owner of the time base calls ``tick`` and ``catch_up``.
 
     Raises ``BenchError`` at construction when the budgets or deadlines of any tick of the hyperperiod do not fit.
     Thread CPU time is taken at every ``cpu_every``-th run of a task (a reading costs more than 1 us).
@@ -133,7 +133,7 @@ class Scheduler:
     # -- running -----------------------------------------------------------------------------------------
 
     def tick(self, due_ns: int, k: int) -> TickInfo:
-        """Run all tasks due at tick ``k``, which was due at ``due_ns``. ``k`` must grow; a gap is a skip.
+        """Run all tasks due at tick ``k``, which was due at ``due_ns`` (bench clock). ``k`` must grow; a gap is a skip.
 
         An exception of a task is marked (``errors``, ``last_error``, a note that names task and tick) and
         goes on to the caller; the tasks that were still to run count as skipped. The scheduler stays usable.
@@ -261,7 +261,7 @@ class Scheduler:
         return self._done_by_ns
 
     def find(self, name: str) -> TaskSpec | None:
-        """Return the task ``name`` of the table, if it is there."""
+        """Return the task ``name`` of the table, or ``None``."""
         return next((task.spec for task in self._tasks if task.spec.name == name), None)
 
     def is_deferred(self, name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Delivers ticks from the DAQ's scans (device clock) or from the host clock.
+"""Delivers ticks from the DAQ's scans or, while no scans come, from the host clock. All times are on the bench clock.
 
 For scans that arrived late in one block, the ``catch_up`` tasks run for every scan, so that filters
 see all data; everything else runs once, for the newest. See ``Scheduler.run``.
@@ -12,13 +12,15 @@ from typing import NamedTuple, Protocol
 from hal.contracts import Clock
 from hal.types import ScanBlock, TimeSource
 
-ROUNDING_NS = 1000  # a timeout in float seconds may come back a little early
+ROUNDING_NS = 1000
+"""Time by which a timeout may end early, because it is given in float seconds."""
 
 
 class Ticks(NamedTuple):
     """Holds ``n`` >= 1 consecutive ticks that are due now, ``dt_ns`` apart; ``k0`` is the first, due at ``due_ns``.
 
-    ``source`` HOST means that no scan came with them.
+    Both times are bench time (ns), also with ``source`` DEVICE_CLOCK: the device's clock numbers the scans, and
+    ``hal.scan_time`` maps the numbers to bench time. ``source`` HOST means that no scan came with the ticks.
     """
 
     k0: int
@@ -53,13 +55,14 @@ class HostTicker:
 
 
 def silent_at_ns(last_due_ns: int, patience_ns: int, now_ns: int) -> int:
-    """Return when a device counts as silent whose last scan was due at ``last_due_ns``. A host that was away for longer
-    than ``patience_ns`` itself has not waited for the device yet. A compiled loop runs the same function."""
+    """Return the time (bench clock, ns) at which a device counts as silent whose last scan was due at ``last_due_ns``.
+    A host that itself did not run for longer than ``patience_ns`` waits for that long from ``now_ns`` on. A compiled
+    loop runs the same function."""
     return (last_due_ns if last_due_ns + patience_ns > now_ns else now_ns) + patience_ns
 
 
 class ScanTicker:
-    """Ticks are the scans of a device: tick number = its sequence number, counted from the first scan.
+    """Delivers the scans of a device as ticks: tick number = its sequence number, counted from the first scan.
 
     ``read(timeout_s)`` fills the owner's buffer and returns the block (row i of the buffer belongs to tick
     ``k0 + i``). When no scan has come for ``silent_after_ns``, ticks come from the host clock, one per

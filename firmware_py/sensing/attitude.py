@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Array, Records, new
+from firmware_py.records import Records, new
 from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnNumbers
 from firmware_py.sensing.config import DEFAULT_METHOD, SensingConfig
 from firmware_py.sensing.error_state import ERROR_STATE_FILTER
 from firmware_py.sensing.quaternion import from_matrix, to_matrix
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.compiled import inlined_kernel, kernel
 from hal.errors import BenchError
 from hal.kernel_calls import ChosenKernel, call_entry, entry

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from firmware_py.records import Array, Records, field, record
+from firmware_py.records import Records, field, record
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 
 
 @record

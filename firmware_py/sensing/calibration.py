@@ -28,8 +28,9 @@ from firmware_py.frame import (
     TEMPERATURE,
     VOLTS,
 )
-from firmware_py.records import Array, Integers, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.sensing.config import MOST_AXES, SensingConfig
+from hal.arrays import Array, IntArray
 from hal.compiled import kernel
 from hal.scratch import scratch
 
@@ -41,13 +42,13 @@ class Calibration:
     """The numbers of ``n`` axes. A supply or temperature channel of -1 is not there."""
 
     lsb_V: float = field("V")
-    channel: Integers = field("1", "n")
+    channel: IntArray = field("1", "n")
     bias_V: Array = field("V", "n")
     scale_V: Array = field("V s^2/m", "n")
     bias_V_per_C: Array = field("V/K", "n")
     scale_per_C: Array = field("1/K", "n")
-    in_plane: Integers = field("1", "n")
-    out_of_plane: Integers = field("1", "n")
+    in_plane: IntArray = field("1", "n")
+    out_of_plane: IntArray = field("1", "n")
     bias_in_plane: Array = field("1, s^2/m", "n", 2)
     bias_out_of_plane: Array = field("1, s^2/m", "n", 2)
     scale_out_of_plane: Array = field("s^2/m, s^4/m^2", "n", 2)

@@ -29,7 +29,6 @@ from __future__ import annotations
 from math import asin, atan2, exp, sqrt
 from typing import NamedTuple
 
-from firmware_py.records import Array
 from firmware_py.sensing.attitude_filter import AttitudeFilter, Motion
 from firmware_py.sensing.attitude_params import error_state_params
 from firmware_py.sensing.error_state_records import (
@@ -46,6 +45,7 @@ from firmware_py.sensing.error_state_records import (
 )
 from firmware_py.sensing.magnet import begin_magnet, find_magnet, heading_spread
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from firmware_py.records import Array, field, record
+from firmware_py.records import field, record
 from firmware_py.sensing.attitude_filter import AttitudeParams, AttitudeState
 from firmware_py.sensing.magnet import Magnet, MagnetParams
+from hal.arrays import Array
 
 ERRORS = 13
 TURN, RATE, BIAS, VELOCITY, DISTURBANCE = 0, 3, 6, 9, 12

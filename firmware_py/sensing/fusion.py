@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from firmware_py.records import Array, Record, new
+from firmware_py.records import Record, new
 from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope, step_gyroscope
+from hal.arrays import Array
 from hal.errors import BenchError
 from hal.plugins import FUSION, load, offered
 from hal.validation import StrictTable

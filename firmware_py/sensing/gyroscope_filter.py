@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.records import Array, Records, field, record
+from firmware_py.records import Records, field, record
 from firmware_py.sensing.attitude import restart
 from firmware_py.sensing.attitude_filter import Motion
 from firmware_py.sensing.error_state import begin_errors, error_state_step
 from firmware_py.sensing.error_state_records import ErrorStateAttitude, ErrorStateNumbers
 from firmware_py.sensing.quaternion import from_matrix
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.compiled import kernel
 
 

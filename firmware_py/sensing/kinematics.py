@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
+from hal.arrays import Array
 from hal.compiled import kernel
 
 MAX_RATE_RAD_S = 20.0

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 from math import cos, exp, log, sin, sqrt
 
-from firmware_py.records import Array, field, record
+from firmware_py.records import field, record
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_matrix
 

@@ -23,7 +23,7 @@ from firmware_py.frame import (
     TIP_ACCELERATION,
     TIP_DISPLACEMENT,
 )
-from firmware_py.records import Array, Records, copy_record, field, new, record
+from firmware_py.records import Records, copy_record, field, new, record
 from firmware_py.sensing.attitude import align, attitude_params, attitude_state, restart, step_attitude
 from firmware_py.sensing.attitude_filter import AttitudeParams, AttitudeState
 from firmware_py.sensing.attitude_params import quiet_point
@@ -41,6 +41,7 @@ from firmware_py.sensing.translation import (
     tip_acceleration,
     translation_params,
 )
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch
 from hal.types import STANDARD_GRAVITY

@@ -12,9 +12,11 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.biquads import cascade_response, cascade_step
 from firmware_py.designs import design
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.sensing.config import SensingConfig
+from hal.arrays import Array
 from hal.compiled import kernel
 
 CORNER_HZ = 2.0
@@ -57,11 +59,8 @@ def displacement_response(
 ) -> NDArray[np.complex128]:
     """Return the complex gain from true tip displacement to the ``tip_displacement`` column, RC filter included."""
     s = 2j * pi * np.asarray(frequency_hz, dtype=np.float64)
-    z = np.exp(s / tick_hz)
     gain = s**2 * cutoff_rad_s / (s + cutoff_rad_s)
-    for b0, b1, b2, a1, a2 in integrator_sections(tick_hz):
-        gain = gain * (b0 + b1 / z + b2 / z**2) / (1.0 + a1 / z + a2 / z**2)
-    return gain
+    return gain * cascade_response(integrator_sections(tick_hz), frequency_hz, tick_hz)
 
 
 @kernel
@@ -110,10 +109,4 @@ def integrate_band(
 ) -> None:
     """``out`` (3,) = band displacement m; ``memory`` (3, 2, 2) of the biquads, direct form II transposed."""
     for i in range(3):
-        x = acceleration[i]
-        for j in range(2):
-            y = sections[j, 0] * x + memory[i, j, 0]
-            memory[i, j, 0] = sections[j, 1] * x - sections[j, 3] * y + memory[i, j, 1]
-            memory[i, j, 1] = sections[j, 2] * x - sections[j, 4] * y
-            x = y
-        out[i] = x
+        out[i] = cascade_step(acceleration[i], memory[i], sections)

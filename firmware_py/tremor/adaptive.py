@@ -1,16 +1,20 @@
-"""Learns, as the hand moves, the causal linear filter that would have served this hand best.
+"""Learns the causal linear filter that predicts this hand's tremor best, while the hand moves.
 
-Some 0.4 s after the fact the tremor is known well, from samples before and after (``adaptive_design``). Regressing it
-on the filter bank's states of then gives the filter that predicts it from the past alone: least squares with
-exponential forgetting, in normal equations, started from the prior hand and scaled to the tremor's own size. Nothing
-recursive is inverted, the matrix is positive definite by construction, and the learned filter is a weighted sum of
-stable filters, so it cannot run away. What sensor noise adds to the regression is known and taken out.
+A tremor is known well some 0.4 s later, from the samples before and after it (``adaptive_design``). Regressing it on
+the filter bank's states at that time gives the filter that predicts it from the past alone: least squares with
+exponential forgetting, in normal equations, which start from the prior hand scaled to the tremor's own power. The
+learned filter is a weighted sum of stable filters, so it is stable. What sensor noise adds to the regression is known
+and subtracted.
 
-Learning is on signals that pass a filter which lifts the tremor band: an error there costs more.
+The normal equations are positive definite by construction. A solution that fails nevertheless, by rounding or because
+a number is not finite, leaves the filter in use unchanged (``_solve``); there is no error.
 
-Near the sensor's noise the best filter is a cautious one, far above it a bold one, and hands go from one to the other
-within a tenth of a second. So two filters are learned, and mixed by a gate: the power of the samples in a wide band,
-over that of what is no tremor. Each row of the regression counts for the two levels as its own gate says.
+Learning uses signals that pass a filter which amplifies the tremor band, so that an error there costs more.
+
+Near the sensor's noise the best filter has a small gain, far above it a large one, and hands change from one to the
+other within a tenth of a second. So two filters are learned, for the levels calm and burst, and mixed by a gate: the
+power of the samples in a wide band, over that of what is no tremor. Each row of the regression counts for the two
+levels as its own gate says.
 """
 
 from __future__ import annotations
@@ -20,20 +24,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.biquads import biquad_step
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import EstimatorParams, EstimatorState, Family, Samples
+from hal.arrays import Array
 from hal.compiled import kernel
 
 STARTED, FED, LEARNED = range(3)
-"""Values of ``AdaptiveState.running``: no tick yet; a tick's data wait to be learned from; they have been."""
+"""Values of ``AdaptiveState.running``: no tick yet; the last tick's data are not learned from yet; they are."""
 
 
 @record
 class AdaptiveParams:
-    """The design's numbers (``adaptive_design``). ``m`` are the states of an axis' filter bank, ``poles`` and ``slows``
-    those of a channel; ``core_`` are the same through the tremor band's filter."""
+    """Holds the numbers of the design (``AdaptiveDesign`` describes them).
+
+    ``m`` is the number of states of an axis' filter bank: for each channel the real and imaginary part of each of the
+    ``poles``, the ``slows`` low-passes, then the sample itself. ``channels`` are the tip's acceleration and the lever's
+    signals, ``LEVELS`` calm and burst, ``OUTPUTS`` tremor now, tremor a loop delay later, and the core of the latter.
+    Fields that begin with ``core_`` are the same through the tremor band's filter.
+    """
 
     pole_re: Array = field("1", "poles")
     pole_im: Array = field("1", "poles")
@@ -59,10 +70,10 @@ class AdaptiveParams:
     start: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")
     onward: Array = field("1", AXES, "channels", "m")
     block_ticks: int = field("1")
-    keep: float = field("1")
-    prior_blocks: Array = field("1", LEVELS)
-    share: Array = field("1", AXES, AXES)  # what the first axis takes from the second
-    outlier: float = field("1")
+    keep: float = field("1")  # factor of all sums at each block
+    prior_blocks: Array = field("1", LEVELS)  # number of blocks that the prior counts for
+    share: Array = field("1", AXES, AXES)  # weight of the second axis' rows in the first axis' regression
+    outlier: float = field("1")  # a row counts fully up to so many times the typical power
     ease: float = field("1")  # share of the way to the solved filter in one tick
     relative: float = field("1")
     relative_power: float = field("1")
@@ -82,31 +93,34 @@ class AdaptiveParams:
 
 @record
 class AdaptiveState:
-    """The filter banks, what the regression has summed, and the filters in use."""
+    """Holds the filter banks, the sums of the regression, and the filters in use. ``AdaptiveParams`` names the indices.
+
+    The tremor is the product of ``filter`` and ``bank``: (m/sample) (sample).
+    """
 
     bank: Array = field("sample", AXES, "m")
-    pending: Array = field("sample", AXES, "channels")  # that the bank holds for this tick, measured or predicted
+    pending: Array = field("sample", AXES, "channels")  # input of the bank in this tick, measured or predicted
     running: int = field("1")  # STARTED, FED or LEARNED
-    weigh: Array = field("sample", AXES, "channels", 2)
-    weighted: Array = field("sample", AXES, "m")
-    gate: Array = field("sample", AXES, 2)
+    weigh: Array = field("sample", AXES, "channels", 2)  # memory of the filter of errors
+    weighted: Array = field("sample", AXES, "m")  # bank of the signals behind that filter
+    gate: Array = field("sample", AXES, 2)  # memory of the gate's band-pass
     gate_power: Array = field("sample^2", AXES)
     burst: Array = field("1", AXES)  # share of the burst's filter
-    sum: Array = field("sample", AXES)
-    in_block: int = field("1")
+    sum: Array = field("sample", AXES)  # of the block so far
+    in_block: int = field("1")  # ticks of the block so far
     blocks: Array = field("sample", AXES, "taps")  # ring of block means
     snapshots: Array = field("sample", AXES, "lags", "m")  # ring of bank states at the ends of blocks
     bursts: Array = field("1", AXES, "lags")  # ring of ``burst`` at the ends of blocks
     n_blocks: int = field("1")
-    normal: Array = field("sample^2", AXES, LEVELS, "m", "m")  # lower triangles
-    right: Array = field("sample m", AXES, LEVELS, OUTPUTS, "m")
-    power: Array = field("m^2", AXES, LEVELS)
-    count: Array = field("1", AXES, LEVELS)
-    filter: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")
-    solved: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")  # where ``filter`` goes
+    normal: Array = field("sample^2", AXES, LEVELS, "m", "m")  # normal matrices, lower triangles
+    right: Array = field("sample m", AXES, LEVELS, OUTPUTS, "m")  # right sides
+    power: Array = field("m^2", AXES, LEVELS)  # weighted sum of the squared tremor
+    count: Array = field("1", AXES, LEVELS)  # weighted number of rows
+    filter: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")  # in use
+    solved: Array = field("m/sample", AXES, LEVELS, OUTPUTS, "m")  # last solution, which ``filter`` approaches
     work: Array = field("sample^2", "m", "m")
     scale: Array = field("1/sample", "m")
-    up: Array = field("1", 3)  # body frame; the four below are the sensors' noise in learning for it
+    up: Array = field("1", 3)  # body frame; the four below are the sensors' noise in learning at this attitude
     noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
     noise_power: Array = field("m^2", AXES)
     core_noise_cross: Array = field("sample m", AXES, OUTPUTS, "m")
@@ -126,14 +140,14 @@ class AdaptiveState:
 
 @record
 class AdaptiveEstimator(EstimatorState):
-    """The estimator's state with the adaptive method."""
+    """Holds the state of an estimator with the adaptive method."""
 
     adaptive: AdaptiveState = field("")
 
 
 @record
 class AdaptiveNumbers(EstimatorParams):
-    """The estimator's parameters with the adaptive method."""
+    """Holds the parameters of an estimator with the adaptive method."""
 
     adaptive: AdaptiveParams = field("")
 
@@ -183,7 +197,7 @@ def adaptive_params(config: TremorConfig) -> Records[AdaptiveParams]:
 
 
 def _shares(config: TremorConfig) -> Array:
-    """(3, 3): axes tell each other the less, the less alike their noise is."""
+    """Return (3, 3), the weight of one axis' rows for another: it falls with the ratio of their noise."""
     lever = config.lever
     noise = np.ones(AXES) if lever is None else np.square([lever.tip_noise(axis) for axis in range(AXES)])
     alike = np.minimum.outer(noise, noise) / np.maximum.outer(noise, noise)
@@ -191,7 +205,7 @@ def _shares(config: TremorConfig) -> Array:
 
 
 def adaptive_state(config: TremorConfig) -> Records[AdaptiveState]:
-    """Return the state before the first sample, which holds the prior hands' filters."""
+    """Return the state before the first sample, whose filters are those of the prior hands."""
     design = design_adaptive(config)
     taps = design.taps.shape[1]
     sizes = {"channels": design.bank.channels, "taps": taps, "lags": taps // 2 + 1}
@@ -237,12 +251,12 @@ def bank_add(bank: Array, channel: int, sample: float, params: AdaptiveParams) -
 
 @kernel
 def adaptive_tick(coasts: bool, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
-    """Advance to the next tick: learn from the last tick's data if that is still to be done, and run the bank on with
-    predicted samples."""
+    """Advance to the next tick: learn from the last tick's data unless ``adaptive_learn`` has, and advance the bank
+    with predicted samples, which ``adaptive_sample`` replaces. ``coasts`` is not used."""
     state, params = states.adaptive, param.adaptive
     adaptive_learn(0, states, param)
     if state.running != STARTED:
-        _ease(state, params)
+        _approach_solution(state, params)
     state.running = FED
     _, channels, m = params.onward.shape
     for i in range(AXES):
@@ -259,7 +273,7 @@ def adaptive_tick(coasts: bool, states: AdaptiveEstimator, param: AdaptiveNumber
 
 @kernel
 def adaptive_learn(_given: int, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
-    """Learn from the tick's data, once: the next tick needs it, this tick's output does not."""
+    """Learn from the tick's data, once. The next tick needs this, the output of this tick does not."""
     if states.adaptive.running == FED:
         _learn(states.adaptive, param.adaptive)
         states.adaptive.running = LEARNED
@@ -267,7 +281,7 @@ def adaptive_learn(_given: int, states: AdaptiveEstimator, param: AdaptiveNumber
 
 @kernel
 def adaptive_sample(samples: Samples, states: AdaptiveEstimator, param: AdaptiveNumbers) -> None:
-    """Replace the predicted samples by the tick's own: of the tip, and the lever's (``LeverConfig``)."""
+    """Replace the predicted samples by the measured ones: of the tip, and of the lever (``LeverConfig``)."""
     state, params = states.adaptive, param.adaptive
     for i in range(3):
         state.up[i] = samples.up[i]
@@ -296,17 +310,9 @@ def _filtered(state: AdaptiveState, axis: int, output: int) -> float:
 
 
 @kernel
-def biquad_step(sample: float, memory: Array, c: Array) -> float:
-    """Filter one sample through b0 b1 b2 a1 a2; ``memory`` (2,), transposed direct form II."""
-    out = c[0] * sample + memory[0]
-    memory[0] = c[1] * sample - c[3] * out + memory[1]
-    memory[1] = c[2] * sample - c[4] * out
-    return out
-
-
-@kernel
 def _learn(state: AdaptiveState, params: AdaptiveParams) -> None:
-    """Weighted bank and block sums take the last sample; at the end of a block the regression takes its row."""
+    """Add the last sample to the weighted bank and to the block's sum. At the end of a block, add a row to the
+    regression and solve one of its systems."""
     for i in range(AXES):
         sample = state.pending[i, 0]
         bank_turn(state.weighted[i], params)
@@ -346,19 +352,20 @@ def _learn(state: AdaptiveState, params: AdaptiveParams) -> None:
             snapshot = state.core_snapshots[i, at % (lag + 1)]
             for j in range(len(snapshot)):
                 snapshot[j] = state.core_weighted[i, j]
-        # the bank must have forgotten its start: a target's length more than the target itself
+        # twice the target's length: the bank's transient at the start has decayed by then
         if at >= 2 * n_taps:
-            _regress(state, i, at, params)
+            _add_row_of_block(state, i, at, params)
     if at >= 2 * n_taps:
-        _know_noise(state, params)
-    axis = at % AXES  # one system a block: no tick has to solve more
+        _update_noise(state, params)
+    axis = at % AXES  # one system per block, so that no tick solves more than one
     if at >= 2 * n_taps:
         _solve(state, axis, (at // AXES) % LEVELS, params)
 
 
 @kernel
-def _know_noise(state: AdaptiveState, params: AdaptiveParams) -> None:
-    """Set the noise's share in learning for the present attitude: gravity carries that of the turns into the tip's."""
+def _update_noise(state: AdaptiveState, params: AdaptiveParams) -> None:
+    """Set the noise terms of the regression for the present attitude, by which gravity turns noise of the angular
+    acceleration into noise of the tip's."""
     channels, one = params.onward.shape[1], params.lean_cross.shape[2]
     for i in range(AXES):
         square = 0.0
@@ -386,8 +393,8 @@ def _know_noise(state: AdaptiveState, params: AdaptiveParams) -> None:
 
 
 @kernel
-def _ease(state: AdaptiveState, params: AdaptiveParams) -> None:
-    """Let the filters in use approach the solved ones: at once, they would step the tip at every solution."""
+def _approach_solution(state: AdaptiveState, params: AdaptiveParams) -> None:
+    """Move the filters in use towards the solved ones by a share per tick, because a step would move the tip."""
     for axis in range(AXES):
         for level in range(LEVELS):
             used, solved = state.filter[axis, level], state.solved[axis, level]
@@ -397,7 +404,7 @@ def _ease(state: AdaptiveState, params: AdaptiveParams) -> None:
 
 
 @kernel
-def _aim(blocks: Array, at: int, taps: Array, target: Array) -> None:
+def _compute_target(blocks: Array, at: int, taps: Array, target: Array) -> None:
     """Set ``target`` (outputs,) to the tremor of ``lag`` blocks ago and of a loop delay later."""
     n_taps = len(blocks)
     for o in range(OUTPUTS):
@@ -420,13 +427,14 @@ def _add_row(normal: Array, right: Array, phi: Array, target: Array, weight: flo
 
 
 @kernel
-def _regress(state: AdaptiveState, axis: int, at: int, params: AdaptiveParams) -> None:
-    """Fill one row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
+def _add_row_of_block(state: AdaptiveState, axis: int, at: int, params: AdaptiveParams) -> None:
+    """Add one row to an axis' systems: the bank of ``lag`` blocks ago, the tremor at that time and a loop delay
+    later."""
     lag = state.blocks.shape[1] // 2
     target = state.target
     burst = state.bursts[axis, (at - lag) % (lag + 1)]
     keep = params.keep
-    _aim(state.blocks[axis], at, params.taps, target)
+    _compute_target(state.blocks[axis], at, params.taps, target)
     now2 = target[0] * target[0]
     phi = state.snapshots[axis, (at - lag) % (lag + 1)]
     for level in range(LEVELS):
@@ -436,7 +444,7 @@ def _regress(state: AdaptiveState, axis: int, at: int, params: AdaptiveParams) -
         _add_row(state.normal[axis, level], state.right[axis, level], phi, target, weight, keep)
         state.row_weight[level] = weight
     if params.relative > 0.0:
-        _aim(state.core_blocks[axis], at, params.taps, target)
+        _compute_target(state.core_blocks[axis], at, params.taps, target)
         phi = state.core_snapshots[axis, (at - lag) % (lag + 1)]
         for level in range(LEVELS):
             weight = state.row_weight[level]
@@ -448,7 +456,7 @@ def _regress(state: AdaptiveState, axis: int, at: int, params: AdaptiveParams) -
 def _row_weight(
     state: AdaptiveState, axis: int, level: int, now2: float, burst: float, params: AdaptiveParams
 ) -> float:
-    """Return how much a row counts for ``level``: a jerk must not outvote the tremor."""
+    """Return the weight of a row for ``level``. A jerk, whose power is above the typical one, is weighted down."""
     n0 = params.prior_blocks[level]
     known = n0 * params.weighted_power[level] + state.power[axis, level]
     typical = known / (n0 + state.count[axis, level])
@@ -457,7 +465,7 @@ def _row_weight(
 
 
 class _Rows(NamedTuple):
-    """The sums of an axis' regression, with the rest and the noise of its prior."""
+    """Holds the sums of an axis' regression, with the rest and the noise of its prior."""
 
     normal: Array
     right: Array
@@ -468,10 +476,10 @@ class _Rows(NamedTuple):
 
 
 @kernel
-def _take(rows: _Rows, share: float, own: float, state: AdaptiveState) -> None:
+def _add_rows(rows: _Rows, share: float, own: float, state: AdaptiveState) -> None:
     """Add ``share`` of an axis' rows to the system, scaled down to the power ``own`` (m^2) a row.
 
-    What is scaled down has too little noise in it for the smaller tremor: the rest is put back.
+    Rows that are scaled down hold too little noise for the smaller tremor, so the prior's rest makes up for it.
     """
     normal, right, rest, noise, count, power = rows
     if count <= 0.0 or power <= 0.0:
@@ -487,7 +495,7 @@ def _take(rows: _Rows, share: float, own: float, state: AdaptiveState) -> None:
 
 @kernel
 def _mean_power(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> float:
-    """Return the mean square of the tremor, m^2, as the regression weighs it, noise taken off."""
+    """Return the mean square of the tremor (m^2) as the regression weighs it, less the noise."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
     known = state.power[axis, level] + n0 * params.weighted_power[level] - state.noise_power[axis] * count
     return max(known / (count + n0), params.least_power)
@@ -495,7 +503,7 @@ def _mean_power(state: AdaptiveState, axis: int, level: int, params: AdaptivePar
 
 @kernel
 def _mean_core_power(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> float:
-    """Return the same behind the tremor band's filter."""
+    """Return the mean square of the tremor (m^2) behind the tremor band's filter, less the noise."""
     count, n0 = state.count[axis, level], params.prior_blocks[level]
     known = (
         state.core_power[axis, level] + n0 * params.core_weighted_power[level] - state.core_noise_power[axis] * count
@@ -505,7 +513,9 @@ def _mean_core_power(state: AdaptiveState, axis: int, level: int, params: Adapti
 
 @kernel
 def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) -> None:
-    """(data + prior) filter = (data + prior) cross: Cholesky of the scaled matrix, in place."""
+    """Solve (data + prior) filter = (data + prior) cross for an axis and level, by Cholesky of the scaled matrix, and
+    put the filter (OUTPUTS, m), m/sample, into ``state.solved``. If the matrix is not positive definite to rounding or
+    not finite, ``solved`` stays as it is: the filter in use goes on towards the last solution."""
     a, right = state.work, state.solution
     m = len(a)
     n0 = params.prior_blocks[level]
@@ -521,7 +531,7 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
             core += _mean_core_power(state, other, level, params)
         wider = whole / core
         by = params.quiet_power
-        rows *= sqrt(wider) if by == 0.5 else wider**by  # 0.5: to the last bit as in recordings of then
+        rows *= sqrt(wider) if by == 0.5 else wider**by  # sqrt: recordings must replay bit for bit
     for i in range(m):
         for j in range(i + 1):
             a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[axis, i, j])
@@ -535,7 +545,7 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
                 state.normal[other, level], state.right[other, level], params.rest[other], state.noise_cross[other],
                 state.count[other, level], state.power[other, level],
             )  # fmt: skip
-            _take(part, share, 1e300 if other == axis else power, state)
+            _add_rows(part, share, 1e300 if other == axis else power, state)
     if params.relative > 0.0:
         counts = params.relative * max(wider - params.relative_beyond, 0.0) ** params.relative_power
         power = _mean_core_power(state, axis, level, params)
@@ -551,12 +561,12 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
                     state.core_normal[other, level], state.core_right[other, level], params.core_rest[other],
                     state.core_noise_cross[other], state.count[other, level], state.core_power[other, level],
                 )  # fmt: skip
-                _take(part, share, 1e300 if other == axis else power, state)
+                _add_rows(part, share, 1e300 if other == axis else power, state)
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])
     if not factorize(a, scale):
-        return  # not positive definite to rounding (or not a number): the last filter stays
+        return
     for o in range(OUTPUTS):
         x = right[o]
         for i in range(m):
@@ -579,10 +589,11 @@ def _solve(state: AdaptiveState, axis: int, level: int, params: AdaptiveParams) 
 @kernel
 def factorize(a: Array, scale: Array) -> bool:
     """Replace ``a`` (m, m), given by its lower triangle and scaled by ``scale`` (m,), by its Cholesky factor and, above
-    the diagonal, the factor's transpose. Return False if it is not positive definite.
+    the diagonal, the factor's transpose. Return False, with ``a`` in an undefined state, if it is not positive definite
+    or not finite.
 
-    A column is taken off all that is below it before the next one begins: the inner loops run along rows, and no sum
-    waits for itself."""
+    A column is subtracted from all columns after it before the next one begins, so the inner loops run along rows and
+    no sum depends on its previous term."""
     m = len(a)
     for i in range(m):
         for j in range(i + 1):

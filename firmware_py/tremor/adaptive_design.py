@@ -20,26 +20,26 @@ from math import cos, isfinite, pi, sin, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.tremor.config import AdaptiveConfig, LeverConfig, TremorConfig
-from hal.arrays import Array
-
-Complex = NDArray[np.complex128]
+from hal.arrays import Array, ComplexArray
 
 GRID_STEP_HZ = 0.02
 GRID_STOP_HZ = 250.0
 AXES = 3
-OUTPUTS = 3  # now, ahead, the part of ahead in the core band
-LEVELS = 2  # calm, burst
+OUTPUTS = 3
+"""Number of a filter's outputs: tremor now, tremor a loop delay later, the part of the latter in the core band."""
+LEVELS = 2
+"""Number of levels of motion: calm, burst."""
 
 
 @dataclass(frozen=True)
 class Bank:
-    """Resonators z <- p z + (1 - |p|) y (two states each), low-passes, and the sample itself; of each channel."""
+    """Describes the filter bank: for each channel resonators z <- p z + (1 - |p|) y (two states each), low-passes, and
+    the sample itself, in this order."""
 
-    pole: Complex
+    pole: ComplexArray
     slow: Array
     channels: int = 1
 
@@ -52,8 +52,8 @@ class Bank:
     def size(self) -> int:
         return self.channels * self.one
 
-    def response(self, z: Complex) -> Complex:
-        """(one, len(z)) from a channel's sample to its features, z = exp(j w / rate)."""
+    def response(self, z: ComplexArray) -> ComplexArray:
+        """Return the response (one, n) from a channel's sample to its features at ``z`` (n,) = exp(j w / rate)."""
         p, gain = self.pole[:, None], 1.0 - np.abs(self.pole[:, None])
         one, other = gain / (1.0 - p / z), gain / (1.0 - np.conj(p) / z)
         out = np.ones((self.one, len(z)), dtype=np.complex128)
@@ -116,20 +116,21 @@ class _Spectra:
     """
 
     hz: Array
-    seen: Complex  # from displacement to sample
+    seen: ComplexArray  # from displacement to sample
     tremor: Array  # (2, f)
     rest: Array
     noise: Array
 
 
 def bank_of(config: AdaptiveConfig, tick_hz: float, channels: int = 1) -> Bank:
+    """Return the filter bank that ``config`` describes, for samples at ``tick_hz``."""
     centre = np.asarray(config.centres_hz)
     pole = np.exp((-pi * config.bandwidth_hz + 2j * pi * centre) / tick_hz)
     return Bank(pole, np.exp(-2.0 * pi * np.asarray(config.slow_hz) / tick_hz), channels)
 
 
 def motion_in_channels(config: TremorConfig) -> Array:
-    """(C, C): covariance of the channels for a motion of the tip of unit variance.
+    """Return the covariance (C, C) of the channels for a motion of the tip of unit variance.
 
     The prior hand's turn about the point that is known best is independent of that point's own motion and has
     ``lever_share`` of the variance. It turns about the arm as much as across it, independently.
@@ -142,7 +143,7 @@ def motion_in_channels(config: TremorConfig) -> Array:
 
 
 def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
-    """(C, C): covariance of the channels' noise for noise of the tip of unit variance."""
+    """Return the covariance (C, C) of the channels' noise for noise of the tip of unit variance."""
     if config.lever is None:
         return np.ones((1, 1))
     if config.lever.noise is None:
@@ -154,7 +155,7 @@ def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
 
 
 def lever_signals(lever: LeverConfig) -> Array:
-    """(3, C, 6): the channels of each axis, from the tip's specific force and the angular acceleration.
+    """Return (3, C, 6), which gives the channels of each axis from the tip's specific force and angular acceleration.
 
     They are the tip's own, arm x alpha along the axis (the turn's part of it) and arm . alpha (the turn about the arm).
     """
@@ -168,7 +169,7 @@ def lever_signals(lever: LeverConfig) -> Array:
 
 @dataclass(frozen=True)
 class Lean:
-    """Noise that gravity carries into the tip's acceleration, as it depends on up (3,) in the body.
+    """Describes the noise that gravity carries into the tip's acceleration, as a function of up (3,) in the body frame.
 
     Noise alpha turns the estimated attitude by -alpha / w^2, and so gravity by g up x alpha / w^2. ``by_up`` (3, C, 3)
     times up gives the covariance of each channel of an axis with the tip's along it, to be divided by w^2;
@@ -193,7 +194,7 @@ def lean_of(config: TremorConfig) -> Lean:
     return Lean(by_up, np.einsum("ikn,nm,ilm->ikl", carried, noise, carried))
 
 
-def sensor_response(config: TremorConfig, hz: Array) -> Complex:
+def sensor_response(config: TremorConfig, hz: Array) -> ComplexArray:
     """Return the response from displacement to sample: the RC filter, and -w^2 for an accelerometer."""
     w = 2.0 * pi * hz
     cutoff = config.filter_cutoff_rad_s
@@ -212,7 +213,7 @@ def sensor_noise(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
 
 
 def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
-    """(m, m): the bank's covariance under ``quiet`` times the sensor's noise above the cancelled band.
+    """Return the bank's covariance (m, m) for ``quiet`` times the sensor's noise above the cancelled band.
 
     The penalty rises over one octave from the upper edge of the band and holds up to half the tick rate. A tip has
     nothing to cancel there: all that a filter passes shakes it, and the stacks' resonance amplifies it
@@ -228,7 +229,7 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
 
 
 def shaking_power(config: TremorConfig, hz: Array) -> Array:
-    """Return (n,): how much of the power of a command at (n,) ``hz`` below half the tick rate shakes the actuators.
+    """Return the share (n,) of a command's power at ``hz`` (n,), below half the tick rate, that shakes the actuators.
 
     A command is held for a tick. So its spectrum repeats about the tick rate, under the hold's sinc, and the first
     image can lie on the actuators' resonance although the command itself cannot. The resonance is anywhere in
@@ -247,7 +248,7 @@ def shaking_power(config: TremorConfig, hz: Array) -> Array:
 
 
 def spectra(config: TremorConfig, axis: int = 0) -> _Spectra:
-    """The prior hand in the sensor's eyes."""
+    """Return the spectra of the prior hand as the sensor measures them along ``axis``."""
     a = config.adaptive
     hz = np.arange(GRID_STEP_HZ, min(GRID_STOP_HZ, 0.5 * config.tick_hz), GRID_STEP_HZ)
     seen = sensor_response(config, hz)
@@ -276,7 +277,8 @@ def band(hz: Array, edges_hz: tuple[float, float, float, float]) -> Array:
 def target_taps(
     config: TremorConfig, block_ticks: int, advance_s: float, edges_hz: tuple[float, float, float, float]
 ) -> Array:
-    """(L,) taps on block means that give displacement in ``band``, L // 2 blocks ago plus ``advance_s``.
+    """Return taps (L,) on block means that give the displacement (m) in the band ``edges_hz``, L // 2 blocks ago plus
+    ``advance_s``.
 
     Least squares over frequency of the displacement's error: fully counted where ``band`` is 0 or 1, a tenth on its
     edges; below the first edge by what voluntary motion and drift are there against a tremor of the prior's size.
@@ -310,25 +312,26 @@ def _drift(config: TremorConfig, hz: Array) -> Array:
     return np.asarray(low_pass * 4.0 * a.drift_m_s2**2 * a.drift_s / (1.0 + (2.0 * pi * hz * a.drift_s) ** 2))
 
 
-def block_response(hz: Array, block_ticks: int, tick_hz: float) -> Complex:
+def block_response(hz: Array, block_ticks: int, tick_hz: float) -> ComplexArray:
     """Return the frequency response of the mean over a block, timed at its last sample."""
     lag = np.exp(-1j * pi * hz * (block_ticks - 1) / tick_hz)
     return _complex(lag * np.sinc(hz * block_ticks / tick_hz) / np.sinc(hz / tick_hz))
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve a positive definite system whose unknowns differ in size. Return (k, m) for ``right`` (k, m)."""
+    """Solve a positive definite system (m, m) whose unknowns differ in size. Return (k, m) for ``right`` (k, m). Raises
+    ``LinAlgError`` for a singular matrix, which no valid configuration gives."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-9 * np.eye(len(matrix))
     return np.asarray(np.linalg.solve(scaled, (right * scale).T).T * scale)
 
 
-def _complex(x: Any) -> Complex:
+def _complex(x: Any) -> ComplexArray:
     return np.asarray(x, dtype=np.complex128)
 
 
-def _polynomial(coefficients: Array, x: Complex) -> Complex:
-    """c0 + c1 x + c2 x^2"""
+def _polynomial(coefficients: Array, x: ComplexArray) -> ComplexArray:
+    """Return c0 + c1 x + c2 x^2."""
     return coefficients[0] + x * (coefficients[1] + x * coefficients[2])
 
 
@@ -363,8 +366,8 @@ class _Prior:
 
     config: TremorConfig
     s: _Spectra
-    plain: Complex
-    target: Complex
+    plain: ComplexArray
+    target: ComplexArray
     wanted: list[Array]
     moving: Array
 
@@ -432,7 +435,7 @@ def _core_filter(config: TremorConfig) -> tuple[Array, Array]:
     return b, denominator
 
 
-def _unweighted(prior: _Prior, bank: Bank, through_gate: Complex) -> dict[str, Any]:
+def _unweighted(prior: _Prior, bank: Bank, through_gate: ComplexArray) -> dict[str, Any]:
     """Return the fields of ``AdaptiveDesign`` that no filter of errors weighs, stacked over the axes."""
     config, s, plain, moving, a = prior.config, prior.s, prior.plain, prior.moving, prior.config.adaptive
     z = _complex(np.exp(1j * (2.0 * pi * s.hz) / config.tick_hz))
@@ -465,7 +468,7 @@ def _over_axes(each: Sequence[Array]) -> Array:
     return np.stack([*each] * (AXES // len(each)))
 
 
-def _weighted(prior: _Prior, errors: tuple[Array, Array], back: Complex) -> WeightedDesign:
+def _weighted(prior: _Prior, errors: tuple[Array, Array], back: ComplexArray) -> WeightedDesign:
     """Return the prior as it is seen through the filter ``errors`` (numerator, denominator). ``back`` (n,): response of
     a delay of one tick."""
     config, s, target, a = prior.config, prior.s, prior.target, prior.config.adaptive
@@ -502,7 +505,7 @@ def _weighted(prior: _Prior, errors: tuple[Array, Array], back: Complex) -> Weig
 
 
 def _lean_noise(
-    config: TremorConfig, s: _Spectra, phi: Complex, weight: Complex, target: Complex
+    config: TremorConfig, s: _Spectra, phi: ComplexArray, weight: ComplexArray, target: ComplexArray
 ) -> tuple[Array, Array]:
     """Return (2, OUTPUTS, one) and (2,): what noise of unit density over w^2 and over w^4 adds to a channel's
     ``noise_cross`` and to ``noise_power``."""
@@ -517,12 +520,13 @@ def _lean_noise(
     return np.array(cross), np.array([np.sum(d * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for d in densities])
 
 
-def _covariance(features: Complex, density: Array, channels: Array) -> Array:
+def _covariance(features: ComplexArray, density: Array, channels: Array) -> Array:
     of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
     return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
 
 
-def _cross(features: Complex, density: Complex | Array, channel: Array) -> Array:
-    """(m,): features of all channels with a signal that ``channel`` (C,) relates to each of them."""
+def _cross(features: ComplexArray, density: ComplexArray | Array, channel: Array) -> Array:
+    """Return the cross-covariance (m,) of all channels' features with a signal that ``channel`` (C,) relates to
+    them."""
     of_tip = np.real(np.conj(features) @ density) * GRID_STEP_HZ
     return np.asarray(np.kron(channel, of_tip), dtype=np.float64)

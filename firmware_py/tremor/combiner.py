@@ -11,12 +11,14 @@ from __future__ import annotations
 from cmath import exp
 from math import pi, sqrt
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.biquads import cascade_step
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
-from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
-from firmware_py.tremor.seen import Seen, seen_params, undo
+from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections
+from firmware_py.tremor.sensor_model import SensorModel, invert_sensor, sensor_params
 from firmware_py.tremor.wflc import WflcParams, WflcState, wflc_params, wflc_step
+from hal.arrays import Array
 from hal.compiled import kernel
 
 TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the start frequency
@@ -24,10 +26,10 @@ TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the star
 
 @record
 class CombinerParams:
-    """Numbers of the WFLC and of the FLC that trails it."""
+    """Holds the parameters of the WFLC and of the FLC that trails it."""
 
     wflc: WflcParams = field("")
-    seen: Seen = field("")
+    sensor: SensorModel = field("")
     sections: Array = field("1", 3, 5)  # of the prefilter
     trailing_gain: float = field("1")
     bias_gain: float = field("1")
@@ -37,7 +39,7 @@ class CombinerParams:
 
 @record
 class CombinerState:
-    """An axis: the WFLC, its prefilter, and the FLC's weights."""
+    """Holds the state of one axis: the WFLC, its prefilter, and the FLC's weights."""
 
     wflc: WflcState = field("")
     memory: Array = field("sample", 3, 2)  # of the prefilter
@@ -50,7 +52,7 @@ def combiner_params(config: TremorConfig) -> Records[CombinerParams]:
     return new(
         CombinerParams,
         wflc=wflc_params(config.wflc, config.tick_hz),
-        seen=seen_params(config),
+        sensor=sensor_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
         trailing_gain=config.wflc.trailing_gain,
         bias_gain=config.wflc.bias_gain,
@@ -68,7 +70,7 @@ def combiner_state(config: TremorConfig) -> Records[CombinerState]:
 @kernel
 def combiner_step(sample: float, state: CombinerState, params: CombinerParams) -> None:
     """Process one sample, taken behind the RC filter."""
-    in_band = prefilter_step(sample, state.memory, params.sections)
+    in_band = cascade_step(sample, state.memory, params.sections)
     wflc_step(in_band, state.wflc, params.wflc)
     state.fixed_phase = (state.fixed_phase + params.wflc.start) % (2.0 * pi)
     phase = state.fixed_phase if params.weights_of == FIXED else state.wflc.phase
@@ -94,7 +96,9 @@ def combiner_displacement(state: CombinerState, params: CombinerParams, ahead_s:
     elif params.weights_of == OWN:
         size = sqrt(state.wflc.power)
         sine, cosine, filtered = size * state.wflc.sine, size * state.wflc.cosine, True
-    phasor = (cosine - 1j * sine) * exp(1j * phase) * undo(omega * params.seen.tick_hz, ahead_s, params.seen)
+    phasor = (
+        (cosine - 1j * sine) * exp(1j * phase) * invert_sensor(omega * params.sensor.tick_hz, ahead_s, params.sensor)
+    )
     if filtered:
         phasor /= prefilter_gain(params.sections, omega)
     return phasor.real

@@ -29,19 +29,19 @@ _FORMER = MappingProxyType(
 
 
 def all_methods() -> tuple[Method, ...]:
-    """Those that are built in, then those of installed packages."""
+    """Return the names of the built-in methods, then those of installed packages."""
     return (*METHODS, *sorted(set(offered(ESTIMATORS)) - set(METHODS)))
 
 
 def why_unknown(method: str) -> str:
-    """Say why ``method`` names no estimator here."""
+    """Return a message that says why ``method`` names no estimator."""
     if method in _FORMER:
         return f"'{method}' is an estimator to compare with: only a source tree has it (tools/research)"
     return f"'{method}' is no estimator; there are: {', '.join(all_methods())}"
 
 
 class WflcConfig(StrictTable):
-    """Weighted-frequency Fourier linear combiner and the combiner that trails it (Ang 2004, 5.2).
+    """Sets the weighted-frequency Fourier linear combiner and the combiner that trails it (Ang 2004, 5.2).
 
     Gains belong to a signal of unit power: the input is normalised by its own (erratum 56).
     """
@@ -87,7 +87,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 
 
 class AdaptiveConfig(StrictTable):
-    """Causal linear filter learned from the hand itself (firmware_py/tremor/adaptive.py).
+    """Sets the causal linear filter that is learned from the hand (``firmware_py.tremor.adaptive``).
 
     ``preset`` names settings that are the start (``PRESETS``). ``memory_s`` is how long the hand is remembered,
     ``prior_s`` how many seconds of data the prior counts for.
@@ -224,11 +224,12 @@ class LeverConfig(StrictTable):
 
 
 class TremorConfig(StrictTable):
-    """Estimator, its horizon, what it sees and when it counts as settled.
+    """Sets the tremor stage: estimator, prediction horizon, kind of samples, time to settle: ``[firmware.tremor]``.
 
     ``sees`` acceleration: samples in m/s^2 of the tip behind the RC filter of ``filter_cutoff_rad_s``. displacement:
     samples in m behind the same filter; a sensor without a filter has ``filter_cutoff_rad_s`` inf. Displacement holds
-    voluntary motion, so all but the adaptive method look at it through the band-pass, unless it is ``isolated``.
+    voluntary motion, so all but the adaptive method use the band-passed samples, unless the motion is ``isolated``.
+    ``loop_delay_s`` is how far ahead the tremor is predicted.
     """
 
     tick_hz: Positive = 1000.0
@@ -239,7 +240,7 @@ class TremorConfig(StrictTable):
     loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0021  # tuned against the emulated tip, one seed
     filter_cutoff_rad_s: Annotated[float, Field(gt=0.0, le=inf)] = 1.0 / (32_000.0 * 0.33e-6)
     lever: LeverConfig | None = None
-    """Without one the acceleration of the tip is all that is known; a bench's own sensors give it."""
+    """Derived from a bench's sensors. Without one only the acceleration of the tip is used."""
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.7
     smoothing_s: Positive = 0.5
     floor_m: Positive = 0.3e-6
@@ -250,7 +251,7 @@ class TremorConfig(StrictTable):
     """Options of a method that an installed package offers."""
     detectors: DetectorConfig = DetectorConfig()
 
-    def __hash__(self) -> int:  # of equal configurations it is equal; ``own`` has none
+    def __hash__(self) -> int:  # ``own`` is a dict and cannot be hashed; equality compares it
         return hash((self.tick_hz, self.loop_delay_s, self.filter_cutoff_rad_s, self.adaptive, self.lever))
 
     @model_validator(mode="before")

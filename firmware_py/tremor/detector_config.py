@@ -6,7 +6,7 @@ from hal.validation import Positive, StrictTable
 
 
 class DetectorConfig(StrictTable):
-    """Bands and limits of chi-squared for slow and brisk jerks, how much acceleration may be left over.
+    """Sets bands and chi-squared limits for slow and brisk jerks, and the largest acceleration that is no drift.
 
     With three degrees of freedom the limits give less than one false alarm in ten minutes (test_detectors.py).
     """

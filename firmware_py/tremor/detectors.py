@@ -16,11 +16,12 @@ from math import exp, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.biquads import cascade_step
 from firmware_py.designs import design
 from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
-from firmware_py.records import Array, Records, copy_record, field, new, record
+from firmware_py.records import Records, copy_record, field, new, record
 from firmware_py.tremor.detector_config import DetectorConfig
-from firmware_py.tremor.prefilter import prefilter_step
+from hal.arrays import Array
 from hal.compiled import kernel
 
 SECTIONS = 3
@@ -29,7 +30,7 @@ BANDS = 2
 
 @record
 class DetectParams:
-    """Numbers of both detectors."""
+    """Holds the parameters of both detectors."""
 
     sections: Array = field("1", BANDS, SECTIONS, 5)
     chi2: Array = field("1", BANDS)
@@ -46,7 +47,7 @@ class DetectParams:
 
 @record
 class DetectState:
-    """The detectors' memory."""
+    """Holds the detectors' memory."""
 
     memory: Array = field("m/s^2", BANDS, 3, SECTIONS, 2)
     power: Array = field("m^2/s^4", BANDS, 3)
@@ -103,7 +104,7 @@ def detect_step(x: NDArray[np.float64], state: DetectState, param: DetectParams)
     for band in range(BANDS):
         total = 0.0
         for i in range(3):
-            y = prefilter_step(x[i], state.memory[band, i], param.sections[band])
+            y = cascade_step(x[i], state.memory[band, i], param.sections[band])
             power = state.power[band, i] + param.floor2
             square = y * y
             total += square / power

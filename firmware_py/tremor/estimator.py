@@ -1,8 +1,9 @@
 """Offers one interface to every tremor estimator: ``step(sample) -> now, ahead, frequency, amplitude, confidence``.
 
-A compiled step processes three axes at a time and allocates nothing. The WFLC runs under every method: it measures the
-frequency. Confidence is the same for all: 1 minus the relative size of what earlier predictions missed; a method that
-lives on the WFLC's frequency has none while the WFLC is not locked.
+A compiled step processes three axes at a time and allocates nothing. The WFLC runs under every method, because it
+measures the frequency. Confidence is computed alike for all methods: 1 minus the relative size of the prediction
+errors. It is 0 until the estimator has settled, and for a method that needs the WFLC's frequency while that is not
+locked.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from firmware_py.records import Array, Records, copy_record, new
+from firmware_py.records import Records, copy_record, new
 from firmware_py.tremor.adaptive import ADAPTIVE
 from firmware_py.tremor.adaptive_design import lever_signals
 from firmware_py.tremor.combiner import (
@@ -27,10 +28,13 @@ from firmware_py.tremor.combiner import (
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, HISTORY, ROWS, TURNS, EstimatorParams, EstimatorState, Family, Samples
 from firmware_py.tremor.own import FOREIGN
+from hal.arrays import Array
 from hal.compiled import inlined_kernel, kernel
 from hal.kernel_calls import ChosenKernel
 
 NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST, CORE = range(6)
+"""Rows of an estimator's output, each of three axes: tremor now (m), tremor ``loop_delay_s`` later (m), frequency (Hz),
+amplitude (m), confidence (0 to 1), and the core of the tremor later (m), which does not yield when the stroke ends."""
 
 
 @kernel
@@ -46,7 +50,7 @@ def _no_sample(samples: Samples, state: EstimatorState, params: EstimatorParams)
 @kernel
 def _combined(axis: int, state: EstimatorState, params: EstimatorParams) -> tuple[float, float, float]:
     own, numbers = state.combiner[axis], params.combiner
-    ahead = combiner_displacement(own, numbers, numbers.seen.delay_s)
+    ahead = combiner_displacement(own, numbers, numbers.sensor.delay_s)
     return combiner_displacement(own, numbers, 0.0), ahead, ahead
 
 
@@ -57,7 +61,7 @@ def _three(config: TremorConfig) -> Any:
 
 COMBINERS = Family(EstimatorParams, EstimatorState, combiner_params, _three, _no_tick, _no_sample, _combined)
 FAMILIES: Mapping[str, Family] = {"adaptive": ADAPTIVE, "own": FOREIGN, "combiner": COMBINERS}
-"""Families by the name of their records. The combiner's records are always there and so come last."""
+"""Families by the name of their record. Every estimator has the combiner's record, so this family comes last."""
 FAMILY_OF: Mapping[str, str] = {"adaptive": "adaptive", "wflc_flc": "combiner", "flc": "combiner", "wflc": "combiner"}
 """Family of each built-in method; a method of another package is of the family "own"."""
 _tick = ChosenKernel(FAMILIES, "tick")
@@ -67,7 +71,9 @@ estimator_learn = ChosenKernel(FAMILIES, "learn")
 
 
 def estimator_params(config: TremorConfig) -> Records[EstimatorParams]:
-    """Return the parameters of ``config.method`` and of the combiner, and in ``fresh`` the state at the start."""
+    """Return the parameters of ``config.method`` and of the combiner; their field ``fresh`` is the state before the
+    first sample. Raises ``BenchError`` for an estimator of another package that breaks the rules of ``OwnEstimator``.
+    """
     name = FAMILY_OF.get(config.method, "own")
     family = FAMILIES[name]
     state = {n: FAMILIES[n].new_state(config) for n in ("combiner", name)}
@@ -88,13 +94,14 @@ def estimator_params(config: TremorConfig) -> Records[EstimatorParams]:
 
 
 def estimator_state(params: Records[EstimatorParams]) -> Records[EstimatorState]:
-    """Return the state before the first sample."""
+    """Return a copy of ``params``' state before the first sample."""
     return cast("Records[EstimatorState]", np.array(params["fresh"]))
 
 
 @inlined_kernel
 def estimator_ticks(state: EstimatorState, steps: int, coast: bool, param: EstimatorParams) -> None:
-    """``steps`` ticks of time; the last one has a sample to come unless ``coast``."""
+    """Advance by ``steps`` ticks. All but the last one coast, that is, the model runs on without a sample; the last one
+    coasts if ``coast``, else ``estimator_samples`` must follow."""
     state.ticks += steps
     for n in range(steps):
         state.at = (state.at + 1) % HISTORY
@@ -107,7 +114,7 @@ def estimator_ticks(state: EstimatorState, steps: int, coast: bool, param: Estim
 
 @inlined_kernel
 def estimator_samples(state: EstimatorState, param: EstimatorParams) -> None:
-    """Process the present tick's ``state.samples``."""
+    """Process the present tick's ``state.samples``, ``turned`` and ``up``, which must be finite."""
     for i in range(AXES):
         combiner_step(state.samples[i], state.combiner[i], param.combiner)
     _sample(Samples(state.samples, state.turned, state.up), state, param)
@@ -115,7 +122,7 @@ def estimator_samples(state: EstimatorState, param: EstimatorParams) -> None:
 
 @inlined_kernel
 def estimator_output(state: EstimatorState, param: EstimatorParams) -> None:
-    """Fill ``state.out``."""
+    """Fill ``state.out`` (6, 3), rows as named above, and update the confidence."""
     out = state.out
     for i in range(AXES):
         now, ahead, core = _output(i, state, param)
@@ -127,7 +134,7 @@ def estimator_output(state: EstimatorState, param: EstimatorParams) -> None:
         out[NOW, i] = now
         out[AHEAD, i] = ahead
         out[CORE, i] = core
-        out[FREQUENCY, i] = state.combiner[i].wflc.omega * param.combiner.seen.tick_hz / (2.0 * pi)
+        out[FREQUENCY, i] = state.combiner[i].wflc.omega * param.combiner.sensor.tick_hz / (2.0 * pi)
         out[AMPLITUDE, i] = sqrt(2.0 * state.power[i])
         trust = 0.0
         if state.ticks > param.settle_ticks and not (param.needs_lock and state.combiner[i].wflc.miss > 0.7):
@@ -140,7 +147,8 @@ def estimator_output(state: EstimatorState, param: EstimatorParams) -> None:
 def run_estimator(
     samples: Array, out: Array, states: Records[EstimatorState], params: Records[EstimatorParams]
 ) -> None:
-    """``samples`` (n, 3), one a tick, into ``out`` (n, 6, 3). A sample that is not finite is coasted over."""
+    """Run the estimator over ``samples`` (n, 3), one row per tick, in m/s^2 or m, and fill ``out`` (n, 6, 3), whose
+    rows are named above. If a sample is not finite on one axis, all three axes coast in that tick."""
     state, param = states[0], params[0]
     for k in range(len(samples)):
         good = True
@@ -158,9 +166,10 @@ def run_estimator(
 
 @dataclass(frozen=True)
 class Estimate:
-    """Arrays (k,) for one sample, (n, k) for many; ``intended_m`` is nan for an accelerometer.
+    """Holds the estimates of k axes: arrays (k,) for one sample, (n, k) for n samples.
 
-    ``now_m``, ``ahead_m``: tremor at the sample and ``loop_delay_s`` later. ``intended_m`` = sample - now_m.
+    ``now_m``, ``ahead_m``: tremor at the sample and ``loop_delay_s`` later. ``confidence``: 0 to 1. ``intended_m``: the
+    sample minus ``now_m``, nan for an accelerometer.
     """
 
     now_m: Array
@@ -172,7 +181,8 @@ class Estimate:
 
 
 class Estimator:
-    """Any method on its own, one to three axes of the tip alone; the instrument's stage uses the same kernels."""
+    """Runs one method on ``axes`` axes (1 to 3) of the tip, without a lever; the instrument's stage uses the same
+    kernels. Raises ``ValueError`` for another number of axes."""
 
     def __init__(self, config: TremorConfig, axes: int = AXES) -> None:
         if not 1 <= axes <= AXES:
@@ -186,11 +196,12 @@ class Estimator:
         copy_record(self.state, estimator_state(self.params))
 
     def step(self, sample: Array) -> Estimate:
-        """``sample`` (axes,) of the next tick, m/s^2 or m as configured; not finite: the model runs on."""
+        """Process ``sample`` (axes,) of the next tick, in m/s^2 or m as ``config.sees`` says. If it is not finite on
+        one axis, all axes coast: the model runs on, and the estimates are predictions."""
         return self._estimate(self._run(np.asarray(sample, dtype=np.float64)[None, :]), sample, 0)
 
     def run(self, samples: Array) -> Estimate:
-        """``samples`` (n, axes): the same numbers as n steps."""
+        """Process ``samples`` (n, axes); the result equals that of n steps."""
         return self._estimate(self._run(samples), samples, slice(None))
 
     def _run(self, samples: Array) -> Array:

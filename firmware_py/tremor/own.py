@@ -1,7 +1,7 @@
-"""An estimator from another package (entry point group ``micron.estimators``) inside the compiled step.
+"""Runs an estimator of another package (entry point group ``micron.estimators``) inside the compiled step.
 
 The step calls it through an address that lies in the parameters, so that a new estimator compiles itself and nothing
-of ours. It sees one axis at a time: the sample as configured, or none, and room for its memory.
+of ours. It gets one axis at a time: the sample as configured, or none in a tick that coasts, and room for its memory.
 """
 
 from __future__ import annotations
@@ -20,20 +20,23 @@ from numba.core.errors import NumbaError
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.family import AXES, EstimatorParams, EstimatorState, Family, Samples
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.plugins import ESTIMATORS, load
 
 STATE = 256
+"""Default length of an estimator's memory, per axis."""
 NUMBERS = 64
+"""Default length of an estimator's parameters."""
 
 
 @record
 class OwnParams:
-    """The arguments of an estimator of another package."""
+    """Holds the arguments of an estimator of another package."""
 
     address: int = field("1")  # of its step
     numbers: Array = field("as its design says", "numbers")
@@ -41,10 +44,10 @@ class OwnParams:
 
 @record
 class OwnState:
-    """The memory and the results of an estimator of another package."""
+    """Holds the memory and the results of an estimator of another package."""
 
     memory: Array = field("as its step says", AXES, "memory")
-    out: Array = field("m", AXES, 2)
+    out: Array = field("m", AXES, 2)  # tremor now, tremor a loop delay later
 
 
 @record
@@ -65,11 +68,12 @@ class ForeignNumbers(EstimatorParams):
 class OwnEstimator:
     """Describes an estimator of another package, which the entry point names.
 
-    ``design(config)``: up to ``most_numbers`` numbers from the configuration, its own options are ``config.own``.
-    ``step(memory, numbers, sample, have, out)``: one tick of one axis, written for numba. ``memory`` (most_memory,) is
-    zero at the start and kept; ``sample`` m/s^2 or m as ``config.sees``, behind the RC filter, counts only if ``have``;
-    ``out`` (2,): tremor in m at the sample and ``config.loop_delay_s`` later. It must not raise.
-    Other sizes than the usual ones compile the whole step of the instrument anew.
+    ``design(config)`` returns up to ``most_numbers`` finite numbers; the bench's options for it are ``config.own``.
+    ``step(memory, numbers, sample, have, out)`` runs one tick of one axis and is written for numba. ``memory``
+    (most_memory,) is zero at the start and kept. ``sample`` is in m/s^2 or m, as ``config.sees`` says, behind the RC
+    filter; with ``have`` False there is none, on all axes of that tick, and the model coasts. ``step`` fills ``out``
+    (2,), the tremor (m) at the sample and ``config.loop_delay_s`` later, and must not raise.
+    Other sizes than the defaults compile the whole step of the instrument anew.
     """
 
     design: Callable[[TremorConfig], Sequence[float] | Array]
@@ -86,7 +90,8 @@ def _estimator(config: TremorConfig) -> OwnEstimator:
 
 
 def own_params(config: TremorConfig) -> Records[OwnParams]:
-    """Return the record of the method's code. ``BenchError`` for a package that does not keep to the rules."""
+    """Return the address and the numbers of the method's step. Raises ``BenchError`` if the design does not return
+    finite numbers or the step cannot be compiled."""
     estimator = _estimator(config)
     most = estimator.most_numbers
     given = np.asarray(estimator.design(config), dtype=np.float64)

@@ -62,9 +62,10 @@ def estimate_kernel(
     amplitude in m, frequency in Hz, confidence from 0 to 1. ``params`` come from ``TremorConfig``
     (``estimator_params``); ``states`` is the memory of the estimator.
 
-    Without a valid new sample the model runs on by itself, so that the prediction stays one for the present tick. After
-    lost scans it runs over the gap; a gap of more than ``TremorConfig.max_gap_ticks`` restarts it. It also restarts
-    while the attitude is aligning. Confidence is 0 until ``TremorConfig.settle_s`` has passed.
+    Without a valid new sample (bits ``INVALID``, ``STALE`` or ``ALIGNING``, which count for all axes) all three axes
+    coast: the model runs on by itself, so that the prediction is one for the present tick. After lost scans it runs
+    over the gap; a gap of more than ``TremorConfig.max_gap_ticks`` restarts it. It also restarts while the attitude is
+    aligning. Confidence is 0 until ``TremorConfig.settle_s`` has passed.
     """
     param = params[0]
     status = int(frame[STATUS])

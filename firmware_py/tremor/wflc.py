@@ -16,7 +16,7 @@ from hal.compiled import kernel
 
 @record
 class WflcParams:
-    """Numbers of the combiner that tracks the frequency."""
+    """Holds the parameters of the combiner that tracks the frequency."""
 
     start: float = field("rad/sample")
     low: float = field("rad/sample")
@@ -29,7 +29,7 @@ class WflcParams:
 
 @record
 class WflcState:
-    """Frequency, phase and weights of the combiner."""
+    """Holds frequency, phase and weights of the combiner."""
 
     omega: float = field("rad/sample")
     phase: float = field("rad")  # running sum of omega, within 2 pi

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from hal.arrays import Int16Array
 from hal.backends import nidaqmx_package
-from hal.contracts import Clock, Int16Array
+from hal.contracts import Clock
 from hal.errors import BenchError, HalTimeout
 from hal.scan_time import ScanTimeline
 from hal.types import ScanBlock, ScanConfig, ScanInfo, Status, TimeSource

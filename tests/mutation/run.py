@@ -37,7 +37,9 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "safety": (("firmware_py/run/safety.py",), ("tests/unit/control/test_safety.py",)),
     "guardian": (
-        tuple(f"firmware_py/guardian/{name}.py" for name in ("amplifier", "care", "gate", "guardian", "heart")),
+        tuple(
+            f"firmware_py/guardian/{name}.py" for name in ("amplifier", "gate", "guardian", "heartbeat", "lifecycle")
+        ),
         ("tests/unit/guardian",),
     ),
     "outputs": (("drivers/output_guard.py",), ("tests/unit/drivers/test_output_guard.py",)),

@@ -14,6 +14,7 @@ from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
 from firmware_py.tremor.config import TremorConfig
+from hal.arrays import Array
 from tests.conftest import DEFAULT_BENCH
 from tools.research.tremor.bench_variant import merged, write_variant
 from tools.research.tremor.bound import bank_features, lift
@@ -28,7 +29,6 @@ from tools.research.tremor.ideal import (
     wanted_motion,
 )
 
-Array = NDArray[np.float64]
 SECONDS = 20.0
 SAMPLE_TO_STROKE_S = 0.6e-3
 """Sample to command over the emulated wires (0.5 ms) and the amplifier's lag (0.1 ms), at any tick rate."""

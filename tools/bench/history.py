@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.frame import Layout
+from hal.arrays import Array
 from tools.diagnose.extremes import extremes
 
 Float32Array = NDArray[np.float32]
-Float64Array = NDArray[np.float64]
 
 BLOCK = 16
 """Rows of one entry of the coarse level."""
@@ -27,7 +27,7 @@ class Buckets(NamedTuple):
 
     first: int
     per_bucket: int
-    t_s: Float64Array
+    t_s: Array
     low: Float32Array
     high: Float32Array
 
@@ -95,13 +95,13 @@ class History:
         """Time of the newest row; 0 before the first."""
         return float(self._fine_t[(self.head - 1) % self._fine.depth]) if self.head else 0.0
 
-    def append(self, rows: Float64Array) -> None:
+    def append(self, rows: Array) -> None:
         """Add ``rows`` (n, columns). More rows than the fine level holds are added in parts."""
         step = self._fine.depth // 2
         for start in range(0, len(rows), step):
             self._append(rows[start : start + step])
 
-    def _append(self, rows: Float64Array) -> None:
+    def _append(self, rows: Array) -> None:
         numbers = np.arange(self.head, self.head + len(rows))
         self._fine_t[numbers % self._fine.depth] = rows[:, self._time_column]
         self._fine.append(rows.T.astype(np.float32))
@@ -115,7 +115,7 @@ class History:
             self._low.append(low)
             self._high.append(high)
 
-    def newest(self, channels: NDArray[np.intp], seconds: float) -> tuple[Float64Array, Float32Array]:
+    def newest(self, channels: NDArray[np.intp], seconds: float) -> tuple[Array, Float32Array]:
         """Return times (n,) in s and single rows of ``channels`` (channels, n): those of the last ``seconds``."""
         ring = self._fine
         t_s = self._fine_t[np.arange(ring.tail, ring.head) % ring.depth]

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-from hal.arrays import Array
-
-Complex = NDArray[np.complex128]
+from hal.arrays import Array, ComplexArray
 
 MAX_LAG_S = 0.02
 TAPS = 64
@@ -48,7 +45,7 @@ class Dynamics:
             return self
         return Dynamics(delay_s=max(0.0, self.delay_s - 0.5 * dt))
 
-    def gain(self, hz: Array) -> Complex:
+    def gain(self, hz: Array) -> ComplexArray:
         """(n,) complex gain of the mechanism at ``hz``, 1 at rest."""
         s = 2j * np.pi * hz
         fast = np.exp(-s * self.delay_s) / (1.0 + s * self.lag_s)
@@ -57,12 +54,12 @@ class Dynamics:
             fast = fast * (w * w / (s * s + 2.0 * self.damping * w * s + w * w))
         return fast * (1.0 - self.slow_share + self.slow_share / (1.0 + s * self.slow_s))
 
-    def held_gain(self, hz: Array, tick_s: float) -> Complex:
+    def held_gain(self, hz: Array, tick_s: float) -> ComplexArray:
         """Return the complex gain (n,) from demands held for ``tick_s`` to the stroke, which moves the tip."""
         x = hz * tick_s
         return self.gain(hz) * np.sinc(x) * np.exp(-1j * np.pi * x)
 
-    def sampled_gain(self, hz: Array, dt: float) -> Complex:
+    def sampled_gain(self, hz: Array, dt: float) -> ComplexArray:
         """(n,) the same as an instrument sees it that reads when a demand begins, at the same rate."""
         if not (self.resonance_hz or self.lag_s):
             return np.exp(-2j * np.pi * hz * self.delay_s)

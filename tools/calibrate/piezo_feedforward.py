@@ -10,13 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.actuation.feedforward import Answer, design_feedforward, tracking_gain
-from hal.arrays import Array
+from hal.arrays import Array, ComplexArray
 from tools.calibrate.piezo_dynamics import Dynamics
-
-Complex = NDArray[np.complex128]
 
 TAPS = 6
 BAND_HZ = 40.0
@@ -75,7 +72,7 @@ class Answers:
     more_s: float
     dt: float
 
-    def late(self, hz: Array) -> Complex:
+    def late(self, hz: Array) -> ComplexArray:
         return np.exp(-2j * np.pi * hz * self.more_s)
 
     def tip(self, tick_s: float) -> Answer:

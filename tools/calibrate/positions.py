@@ -13,7 +13,6 @@ curvature of the axes that no calibration has found would do.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,12 @@ from scipy.stats import t as student
 
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
-from hal.arrays import Array
+from hal.arrays import AnyArray, Array
 from hal.types import STANDARD_GRAVITY
 from tools.calibrate.multi_position import Estimate
 from tools.calibrate.pivot_spline import Basis, Step, gauss_newton, uniform_basis
 from tools.errors import InputError
 
-Complex = NDArray[Any]
-"""Real numbers, or complex ones for a derivative."""
 FIT_HZ = 50.0
 KNOT_S = 0.05
 LOWPASS_HZ, SLOPE_HZ = 10.0, 4.0
@@ -85,7 +82,7 @@ class _Problem:
     tip: Array
     gravity: float
 
-    def split(self, x: Complex) -> dict[str, Complex]:
+    def split(self, x: AnyArray) -> dict[str, AnyArray]:
         """Globals by name: places (P, 3), bias (N,), sensitivity (N, 3), filter (N,), earth (2,), delay (1,)."""
         n, p = len(self.axes), int(self.place_of.max()) + 1
         sizes = {"places": 3 * p, "bias": n, "sensitivity": 3 * n, "filter": n, "earth": 2, "field delay": 1}
@@ -95,7 +92,7 @@ class _Problem:
             at += size
         return out
 
-    def motion(self, curves: Complex) -> tuple[Complex, Complex, Complex, Complex]:
+    def motion(self, curves: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
         """Return the body vectors of up and north-west (n, 3) each and the rates from angle curves (3, n, 3); may be
         complex.
 
@@ -122,7 +119,7 @@ class _Problem:
         )
         return world[:, 2], world[:, 0], omega, alpha
 
-    def force(self, curves: Complex, places: Complex) -> Complex:
+    def force(self, curves: AnyArray, places: AnyArray) -> AnyArray:
         """Return the specific force (n, N, 3) in m/s^2 at each axis."""
         up, _, omega, alpha = self.motion(curves)
         rho = (places.reshape(-1, 3) - self.tip)[self.place_of]
@@ -135,7 +132,7 @@ class _Problem:
             - square[:, None, None] * rho[None]
         )
 
-    def predict(self, curves: Complex, x: Complex) -> Complex:
+    def predict(self, curves: AnyArray, x: AnyArray) -> AnyArray:
         """Return readings and field (n, N + 3)."""
         g = self.split(x)
         axes = self.axes + g["sensitivity"].reshape(-1, 3)

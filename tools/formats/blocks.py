@@ -7,13 +7,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from firmware_py.recording.format import TICK_COLUMN, TIME_COLUMN, Float64Array
+from firmware_py.recording.format import TICK_COLUMN, TIME_COLUMN
 from firmware_py.recording.reader import Recording
+from hal.arrays import Array
 
 
-def batches(recording: Recording, n_blocks: int) -> Iterator[tuple[int, Float64Array]]:
+def batches(recording: Recording, n_blocks: int) -> Iterator[tuple[int, Array]]:
     """Yield the index of the first row in the file, and ``n_blocks`` blocks at a time (columns, rows)."""
-    waiting: list[Float64Array] = []
+    waiting: list[Array] = []
     start = rows = 0
     for block in recording.blocks():
         waiting.append(block.data)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from firmware_py.actuation.config import ActuationConfig
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 PINS = np.array([[1.0, 0.0], [-0.5, np.sqrt(3) / 2], [-0.5, -np.sqrt(3) / 2]])  # Ang 2004 (6.1), (6.2) for R = r = 1
 
 

@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 from firmware_py.run import findings
-from firmware_py.run.findings import CauseClass, Finding, finding_of_button, finding_of_output, finding_of_scans
+from firmware_py.run.findings import (
+    CauseClass,
+    Finding,
+    classify_button_error,
+    classify_output_error,
+    classify_scan_error,
+)
 from hal.errors import (
     BusError,
     Disconnected,
@@ -25,7 +31,7 @@ from hal.errors import (
 from tools.research.reports.findings_page import markdown
 
 ROOT = Path(__file__).parents[3]
-REPORTS = {"report": 1, "doubt": 1, "report_error": 3, "bad_for": 4}
+REPORTS = {"report": 1, "doubt": 1, "report_error": 3, "report_after": 4}
 """Ways of Incidents to a consequence, with the number of their own arguments."""
 INSIDE = {Finding.TOO_MANY_HOLDS, Finding.HOLD_TOO_LONG, Finding.NEUTRAL_NOT_REACHED}
 """Findings that Incidents and the supervisor make of others."""
@@ -50,7 +56,9 @@ def findings_of(call: ast.Call) -> list[Finding]:
     first = call.args[0]
     if isinstance(first, ast.Attribute) and ast.unparse(first.value) == "Finding":
         return [Finding[first.attr]]
-    chooser = first.func.id if isinstance(first, ast.Call) and isinstance(first.func, ast.Name) else "finding_of_scans"
+    chooser = (
+        first.func.id if isinstance(first, ast.Call) and isinstance(first.func, ast.Name) else "classify_scan_error"
+    )
     source = ast.parse(Path(findings.__file__).read_text(encoding="utf-8"))
     function = next(n for n in source.body if isinstance(n, ast.FunctionDef) and n.name == chooser)
     return [
@@ -108,11 +116,11 @@ def test_what_a_person_wants_is_never_recoverable():
     ],
 )
 def test_what_an_error_of_reading_scans_means(error: HalError, finding: Finding):
-    assert finding_of_scans(error, 0.0) is finding
+    assert classify_scan_error(error, 0.0) is finding
 
 
 def test_an_overflow_while_the_host_stood_still_is_the_hosts():
-    assert finding_of_scans(Overrun("full"), 200.0) is Finding.DAQ_OVERFLOW_BY_HOST
+    assert classify_scan_error(Overrun("full"), 200.0) is Finding.DAQ_OVERFLOW_BY_HOST
 
 
 @pytest.mark.parametrize(
@@ -127,12 +135,12 @@ def test_an_overflow_while_the_host_stood_still_is_the_hosts():
     ],
 )
 def test_what_an_error_of_the_outputs_means(error: HalError, finding: Finding):
-    assert finding_of_output(error) is finding
+    assert classify_output_error(error) is finding
 
 
 def test_what_an_error_of_the_buttons_bus_means():
-    assert finding_of_button(Disconnected("gone")) is Finding.BUTTON_GONE
-    assert finding_of_button(BusError("bus-off")) is Finding.BUTTON_BUS
+    assert classify_button_error(Disconnected("gone")) is Finding.BUTTON_GONE
+    assert classify_button_error(BusError("bus-off")) is Finding.BUTTON_BUS
 
 
 def test_the_page_is_current():

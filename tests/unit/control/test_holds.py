@@ -18,8 +18,8 @@ MS = 1_000_000
 class Stand:
     """A running supervisor with an amplifier that is at neutral at once."""
 
-    def __init__(self, state: State = State.RUNNING, *, spares_host: bool = False, **limits: Any) -> None:
-        run = StandRun(state, SafetyLimits(**limits), spares_host=spares_host)
+    def __init__(self, state: State = State.RUNNING, *, allows_host_stalls: bool = False, **limits: Any) -> None:
+        run = StandRun(state, SafetyLimits(**limits), allows_host_stalls=allows_host_stalls)
         self.clock, self.limits, self.counts = run.clock, run.limits, run.counts
         self.supervisor, self.incidents = run.supervisor, run.incidents
         self.clock.burn_ns(1000 * MS)
@@ -94,7 +94,7 @@ def test_the_fourth_hold_within_a_minute_is_none_and_says_so():
 
 
 def test_pauses_of_the_host_do_not_count_where_no_device_is_real():
-    stand = Stand(spares_host=True)
+    stand = Stand(allows_host_stalls=True)
     for _ in range(5):
         stand.incidents.report(Finding.HOST_OVERSLEPT, stall_ms=9.0, device="daq")
         stand.supervisor.step()
@@ -132,9 +132,9 @@ def test_a_hold_whose_outputs_cannot_be_armed_is_given_up():
         assert stand.may_end_after(200.0)
         stand.holds.note_refusal(stand.clock.now_ns())
         stand.holds.interrupt(stand.clock.now_ns(), "piezo: no answer")
-        assert not stand.holds.is_too_long(stand.clock.now_ns())
+        assert not stand.holds.has_timed_out(stand.clock.now_ns())
     stand.clock.burn_ns(200 * MS)
-    assert stand.holds.is_too_long(stand.clock.now_ns())
+    assert stand.holds.has_timed_out(stand.clock.now_ns())
 
 
 def test_a_person_may_try_again_at_any_time():
@@ -142,7 +142,7 @@ def test_a_person_may_try_again_at_any_time():
     assert not stand.may_end_after(200.0)
     stand.holds.note_refusal(stand.clock.now_ns())
     assert not stand.may_end_after(10_000.0)
-    assert not stand.holds.is_too_long(stand.clock.now_ns())
+    assert not stand.holds.has_timed_out(stand.clock.now_ns())
 
 
 def test_a_hold_that_does_not_become_good_is_given_up():
@@ -150,10 +150,10 @@ def test_a_hold_that_does_not_become_good_is_given_up():
     for _ in range(29):
         stand.clock.burn_ns(100 * MS)
         stand.silence()
-        assert not stand.holds.is_too_long(stand.clock.now_ns())
+        assert not stand.holds.has_timed_out(stand.clock.now_ns())
     stand.clock.burn_ns(100 * MS)
-    assert stand.holds.is_too_long(stand.clock.now_ns())
-    stand.incidents.give_hold_up()
+    assert stand.holds.has_timed_out(stand.clock.now_ns())
+    stand.incidents.abandon_hold()
     assert stand.trip == (
         "daq: no new scan for 5 ms; check its link; it has not passed within 3000 ms ([firmware.safety] hold_limit_ms)"
     )
@@ -162,13 +162,13 @@ def test_a_hold_that_does_not_become_good_is_given_up():
 def test_what_it_waits_for_in_the_end_is_told_beside_the_first_cause():
     stand = Stand().held()
     stand.holds.interrupt(stand.clock.now_ns(), "attitude is not aligned")
-    stand.incidents.give_hold_up()
+    stand.incidents.abandon_hold()
     assert "check its link; then attitude is not aligned; it has not" in stand.trip
 
 
 def test_nothing_is_given_up_without_a_hold():
     stand = Stand()
-    stand.incidents.give_hold_up()
+    stand.incidents.abandon_hold()
     assert not stand.trip
     assert stand.holds.as_status(stand.clock.now_ns()) is None
 
@@ -179,7 +179,7 @@ def test_the_operator_is_heard_only_once_the_cause_has_passed():
     assert not stand.may_end_after(200.0), "an order that came too early is not kept"
     assert stand.holds.waits_for == OPERATOR
     assert not stand.may_end_after(60_000.0)
-    assert not stand.holds.is_too_long(stand.clock.now_ns()), "a person may take any time"
+    assert not stand.holds.has_timed_out(stand.clock.now_ns()), "a person may take any time"
     status = stand.holds.as_status(stand.clock.now_ns())
     assert status is not None
     assert (status["class"], status["waits_for"], status["rearm"]) == ("link", OPERATOR, "operator")
@@ -224,11 +224,11 @@ def test_the_list_of_holds_counts_from_the_start_of_the_run():
 
 def test_a_gap_of_the_host_is_remembered_for_a_while():
     gaps = HostGaps(5.0)
-    gaps.look(10 * MS, 14 * MS)
+    gaps.record(10 * MS, 14 * MS)
     assert gaps.stalls == 0
-    gaps.look(10 * MS, 15 * MS)
-    gaps.look(20 * MS, 50 * MS)
-    gaps.look(60 * MS, 66 * MS)
+    gaps.record(10 * MS, 15 * MS)
+    gaps.record(20 * MS, 50 * MS)
+    gaps.record(60 * MS, 66 * MS)
     assert (gaps.stalls, gaps.longest_ms) == (3, 30.0)
     assert gaps.recent_ms(76 * MS, 10.0) == 6.0
     assert gaps.recent_ms(77 * MS, 10.0) == 0.0

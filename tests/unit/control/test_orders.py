@@ -66,7 +66,7 @@ class Desk:
     def say(self, *messages: Any) -> None:
         for message in messages:
             self.page.send(message if isinstance(message, bytes) else json.dumps(message).encode())
-        self.orders.obey_all()
+        self.orders.handle_orders()
 
 
 @pytest.fixture
@@ -138,9 +138,9 @@ def test_an_eager_page_costs_a_tick_a_few_orders_and_a_gone_one_none(desk: Desk)
     desk.say(*({"order": "gain", "value": i / 100} for i in range(2 * MAX_ORDERS)))
     assert desk.params["gain"] == (MAX_ORDERS - 1) / 100
     desk.page.close()
-    desk.orders.obey_all()
+    desk.orders.handle_orders()
     assert desk.params["gain"] == (2 * MAX_ORDERS - 1) / 100
-    desk.orders.obey_all()
+    desk.orders.handle_orders()
     assert list(desk.link.orders()) == []
 
 
@@ -157,13 +157,13 @@ def test_a_doubt_holds_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: D
     words = {"value": 3.0, "low": 4.5, "high": 5.5}
     for each in (desk, looking):
         for t_ms in (0, 20, 40):
-            each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, t_ms * MS, 50.0, **words)
-        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, False, 45 * MS, 50.0, **words)
-        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 46 * MS, 50.0, **words)
-        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 95 * MS, 50.0, **words)
+            each.incidents.report_after(Finding.SUPPLY_OUTSIDE, True, t_ms * MS, 50.0, **words)
+        each.incidents.report_after(Finding.SUPPLY_OUTSIDE, False, 45 * MS, 50.0, **words)
+        each.incidents.report_after(Finding.SUPPLY_OUTSIDE, True, 46 * MS, 50.0, **words)
+        each.incidents.report_after(Finding.SUPPLY_OUTSIDE, True, 95 * MS, 50.0, **words)
         assert not each.supervisor.holds, "it was good in between"
         assert not each.counts.noticed
-        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 96 * MS, 50.0, **words)
+        each.incidents.report_after(Finding.SUPPLY_OUTSIDE, True, 96 * MS, 50.0, **words)
     assert [hold.reason for hold in desk.supervisor.holds] == ["supply 3.00 V is outside 4.5..5.5 V"]
     assert desk.supervisor.state is State.HOLD_RAMP
     assert looking.supervisor.trip_cause is None

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.records import Array, Integers, Records, attributes, field, new, record
+from firmware_py.records import Records, attributes, field, new, record
+from hal.arrays import Array, IntArray
 
 
 @record
@@ -29,7 +30,7 @@ class Whole(Base):
 
     inner: Inner = field("")
     several: Records[Inner] = field("", 3)
-    places: Integers = field("1", "n")
+    places: IntArray = field("1", "n")
 
 
 def test_layout_is_as_declared_and_fields_of_the_base_come_first() -> None:

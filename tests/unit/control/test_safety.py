@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.run.findings import CauseClass, Finding
 from firmware_py.run.safety import RAMP_TICKS, State, Supervisor, Trip
-from hal.contracts import Float64Array
+from hal.arrays import Array
 from hal.errors import I2cNack, SafetyTrip
 from hal.types import OutputLimit
 
@@ -26,7 +26,7 @@ class FakeAmplifier:
             raise SafetyTrip("read-back differs from what was written", device="piezo")
         self.armed = True
 
-    def write(self, values_V: Float64Array) -> int:
+    def write(self, values_V: Array) -> int:
         return 0
 
     def safe_step(self) -> bool:
@@ -37,7 +37,7 @@ class FakeAmplifier:
         self.ticks -= 1
         return self.ticks <= 0
 
-    def readback_V(self) -> Float64Array:
+    def readback_V(self) -> Array:
         return np.zeros(1)
 
     def close(self) -> None:

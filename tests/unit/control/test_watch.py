@@ -12,14 +12,14 @@ from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
 from firmware_py.control.watch import Watch
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import LAYOUT, STATUS, SUPPLY, TEMPERATURE, FrameStatus
-from firmware_py.guardian.care import GuardianCare
-from firmware_py.guardian.heart import Heart, Why
+from firmware_py.guardian.heartbeat import Heartbeat, TakeoverReason
+from firmware_py.guardian.lifecycle import GuardianLifecycle
 from firmware_py.run.findings import CauseClass
 from firmware_py.run.safety import SafetyLimits, State
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalTimeout
 from tests.unit.control.stand import StandOutput, StandRun
-from tests.unit.guardian.keeper import Kept
+from tests.unit.guardian.handle import FakeHandle
 
 WIDTH = max(column.start + column.size for column in LAYOUT)
 
@@ -75,10 +75,10 @@ def bench_of(**devices: Any) -> Devices:
     ],
 )
 def test_an_output_that_the_guardian_has_moved_is_not_the_amplifiers_fault(taken: bool, look: str, says: str) -> None:
-    heart = Heart()
+    heartbeat = Heartbeat()
     if taken:
-        heart.take(Why.SILENT, 7)
-    run = StandRun(guardian=GuardianCare(Kept(heart)))
+        heartbeat.take_outputs(TakeoverReason.SILENT, 7)
+    run = StandRun(guardian=GuardianLifecycle(FakeHandle(heartbeat)))
     supervisor = run.supervisor
     devices = bench_of(
         verify_output=lambda: "output 1 holds 50 V and was told 29 V",
@@ -157,13 +157,13 @@ def test_the_stop_button_and_its_silence() -> None:
 
 
 def test_a_guardian_that_is_lost_holds_the_outputs_and_where_nothing_is_armed_nobody_looks() -> None:
-    keeper = Kept()
-    lost = GuardianCare(keeper)
-    keeper.alive = False
+    handle = FakeHandle()
+    lost = GuardianLifecycle(handle)
+    handle.alive = False
     assert Watched(guardian=lost).supervise() == (
         "the guardian of the outputs is lost: its process has ended; a new one is started"
     )
-    assert not Watched(guardian=GuardianCare(Kept())).supervise()
+    assert not Watched(guardian=GuardianLifecycle(FakeHandle())).supervise()
     assert not Watched(State.SENSING_ONLY, guardian=lost).supervise()
 
 

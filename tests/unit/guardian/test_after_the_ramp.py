@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.guardian.guardian import HOLD_NS, STEP_NS, Guardian, State
-from firmware_py.guardian.heart import Heart, Why
+from firmware_py.guardian.heartbeat import Heartbeat, TakeoverReason
 from hal.clock import VirtualClock
 from hal.errors import HalTimeout
 
@@ -49,10 +49,10 @@ class Bench:
     """A guardian whose firmware has died, stepped once a millisecond in virtual time."""
 
     def __init__(self) -> None:
-        self.clock, self.heart, self.dac = VirtualClock(10_000_000), Heart(), Dac()
-        self.heart.beat(self.clock.now_ns())
-        self.guardian = Guardian(self.heart, self.dac, self.clock, notice_ms=3.0, limit_ms=16.0)
-        self.guardian._take(Why.DIED, self.clock.now_ns())
+        self.clock, self.heartbeat, self.dac = VirtualClock(10_000_000), Heartbeat(), Dac()
+        self.heartbeat.beat(self.clock.now_ns())
+        self.guardian = Guardian(self.heartbeat, self.dac, self.clock, notice_ms=3.0, limit_ms=16.0)
+        self.guardian._take(TakeoverReason.DIED, self.clock.now_ns())
 
     def step(self) -> None:
         self.guardian.step(alive=False)

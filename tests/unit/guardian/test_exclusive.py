@@ -10,8 +10,8 @@ import pytest
 
 from drivers.piezo.dac_amplifier import DacAmplifier
 from firmware_py.guardian.amplifier import GuardedAmplifier
-from firmware_py.guardian.guardian import CLAIM_NS, LAST_RESORT_NS, STEP_NS, Guardian, State
-from firmware_py.guardian.heart import Heart, Order, Phase, Why
+from firmware_py.guardian.guardian import LAST_RESORT_NS, STEP_NS, STUCK_COMMAND_NS, Guardian, State
+from firmware_py.guardian.heartbeat import Heartbeat, Phase, TakeoverReason
 from hal.clock import VirtualClock
 from hal.errors import SafetyTrip
 from hal.middleware.faults import FaultI2c, FaultPlan
@@ -19,6 +19,7 @@ from hal.types import I2cOp, I2cWrite, PortInfo
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.transports.lockstep import LockstepI2cBus
+from tests.unit.guardian.handle import begin_command
 from tests.unit.guardian.test_guardian import Held
 
 MS = 1_000_000
@@ -57,16 +58,16 @@ class Stand:
         line.attach(0x0C, self.dac)
         bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
         self.slow = FaultI2c(Spy(bus, "firmware", self.sent, self.clock), self.clock, FaultPlan())
-        self.heart = Heart()
+        self.heartbeat = Heartbeat()
         self.guardian = Guardian(
-            self.heart, DacAmplifier(Spy(bus, "guardian", self.sent, self.clock), self.clock), self.clock,
-            notice_ms=8.0, limit_ms=LEASE_MS + 1.0, end=end,
+            self.heartbeat, DacAmplifier(Spy(bus, "guardian", self.sent, self.clock), self.clock), self.clock,
+            notice_ms=8.0, limit_ms=LEASE_MS + 1.0, kill_firmware=end,
         )  # fmt: skip
         self.amplifier = GuardedAmplifier(
             DacAmplifier(self.slow, self.clock), Held(self), self.clock, lease_ms=LEASE_MS
         )
         self.clock.burn_ns(STEP_NS)
-        self.heart.watch(self.clock.now_ns())
+        self.heartbeat.note_guardian_alive(self.clock.now_ns())
         self.amplifier.arm()
         if guardian_steps:
             self.clock.at(self.clock.now_ns() + STEP_NS // 2, self._step)
@@ -141,7 +142,7 @@ def test_outputs_come_back_in_a_handshake_three_times(stall_ms: float, phase_us:
         at_ns = (began_ns // STEP_NS + 3) * STEP_NS + phase_us * 1000
         stand.clock.at(at_ns, lambda _: stand.clock.burn_ns(round(stall_ms * MS)))
         assert "lost the outputs to the guardian" in stand.run(130, alternating)
-        assert not stand.heart.taken_ns, "it gives them back 50 ms after neutral"
+        assert not stand.heartbeat.taken_ns, "it gives them back 50 ms after neutral"
         report = stand.guardian.report()
         stand.amplifier.arm()
         armed_ns = stand.clock.now_ns()
@@ -159,7 +160,7 @@ def test_outputs_that_are_wanted_at_once_are_waited_for():
     stand.clock.burn_ns(50 * MS)
     assert stand.run(25, alternating)
     report = stand.guardian.report()
-    assert stand.heart.taken_ns
+    assert stand.heartbeat.taken_ns
     stand.amplifier.arm()
     assert stand.clock.now_ns() - report["neutral_ns"] > 50 * MS
     assert not stand.run(5, alternating)
@@ -182,8 +183,8 @@ def test_a_firmware_that_dies_after_it_got_its_outputs_back_is_brought_to_neutra
 def test_a_guardian_that_keeps_the_outputs_or_had_to_be_ended_ends_the_run():
     stand = Stand(guardian_steps=False)
     stand.run(5)
-    stand.heart.watch(stand.clock.now_ns())
-    stand.heart.take(Why.SILENT, stand.clock.now_ns())
+    stand.heartbeat.note_guardian_alive(stand.clock.now_ns())
+    stand.heartbeat.take_outputs(TakeoverReason.SILENT, stand.clock.now_ns())
     with pytest.raises(SafetyTrip, match="does not give the outputs back"):
         stand.amplifier.arm()
     stand = Stand(guardian_steps=False)
@@ -210,7 +211,7 @@ def test_a_command_that_stands_before_the_wire_ends_the_firmware_before_the_guar
         stand.run(1, lambda k: FAR_V)
     late_ns = stand.clock.now_ns()
     assert len(ended) == 1
-    assert CLAIM_NS < ended[0] - stand.heart.taken_ns <= CLAIM_NS + 2 * MS
+    assert STUCK_COMMAND_NS < ended[0] - stand.heartbeat.taken_ns <= STUCK_COMMAND_NS + 2 * MS
     assert stand.commands_of("guardian") == []  # it waits for the death
     while stand.guardian.state is not State.DONE:
         stand.tick()
@@ -226,7 +227,7 @@ def test_who_may_not_end_the_firmware_waits_for_its_command_and_undoes_it_in_the
     stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.08))
     began_ns = stand.clock.now_ns()
     stand.run(1, lambda k: FAR_V)  # comes out 80 ms late, before the last resort
-    assert stand.commands_of("firmware")[-1] > stand.heart.taken_ns
+    assert stand.commands_of("firmware")[-1] > stand.heartbeat.taken_ns
     assert all(t_ns > stand.commands_of("firmware")[-1] for t_ns in stand.commands_of("guardian"))
     assert stand.run(60)
     assert stand.guardian.exclusive
@@ -240,7 +241,7 @@ def test_outputs_do_not_wait_for_ever_and_the_report_says_so():
     stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.4))
     stand.run(1, lambda k: FAR_V)
     first_ns = min(stand.commands_of("guardian"))
-    assert LAST_RESORT_NS <= first_ns - stand.heart.taken_ns < LAST_RESORT_NS + 2 * MS
+    assert LAST_RESORT_NS <= first_ns - stand.heartbeat.taken_ns < LAST_RESORT_NS + 2 * MS
     assert not stand.guardian.report()["exclusive"]
 
 
@@ -253,7 +254,7 @@ def test_neutral_that_a_late_command_has_left_is_not_told():
     stand.amplifier.write(FAR_V)
     stand.slow.arm(FaultPlan())
     arrived_ns = stand.clock.now_ns()
-    assert stand.heart.reached_ns < arrived_ns
+    assert stand.heartbeat.neutral_ns < arrived_ns
     assert stand.volts() != pytest.approx([50.0] * 3)
     while not stand.amplifier.safe_step():
         stand.tick()
@@ -296,15 +297,15 @@ def test_close_does_not_wait_for_a_guardian_that_is_gone():
     stand.amplifier.close()
     assert stand.guardian.state is State.DONE
     assert stand.volts() == pytest.approx([50.0] * 3)
-    assert stand.heart.phase is Phase.IDLE
+    assert stand.heartbeat.phase is Phase.IDLE
 
 
 @pytest.mark.parametrize("repeats", [False, True])
 def test_the_word_in_shared_memory_carries_codes_and_flag(repeats: bool):
-    heart = Heart.shared()
-    assert heart.fd is not None
-    assert heart.inside is None
-    heart.enter(Order((0xFFFF, 0, 0x8001), repeats))
-    assert Heart(heart.fd).inside == ((0xFFFF, 0, 0x8001), repeats)
-    heart.leave()
-    assert Heart(heart.fd).inside is None
+    heartbeat = Heartbeat.shared()
+    assert heartbeat.fd is not None
+    assert heartbeat.command_in_flight is None
+    begin_command(heartbeat, (0xFFFF, 0, 0x8001), repeats=repeats)
+    assert Heartbeat(heartbeat.fd).command_in_flight == ((0xFFFF, 0, 0x8001), repeats)
+    heartbeat.end_command()
+    assert Heartbeat(heartbeat.fd).command_in_flight is None

@@ -11,7 +11,7 @@ import pytest
 from drivers.piezo.dac_amplifier import DacAmplifier
 from firmware_py.guardian.amplifier import GuardedAmplifier
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
-from firmware_py.guardian.heart import Heart, Phase, Why
+from firmware_py.guardian.heartbeat import Heartbeat, Phase, TakeoverReason
 from hal.clock import VirtualClock
 from hal.errors import I2cNack, SafetyTrip
 from hal.middleware.faults import FaultI2c, FaultPlan
@@ -24,25 +24,25 @@ FAR = np.array([90.0, 10.0, 60.0])
 
 
 class Held:
-    """``Keeper`` of the guardian of ``stand``; nobody starts another one."""
+    """``GuardianHandle`` of the guardian of ``stand``; nobody starts another one."""
 
     def __init__(self, stand: Any) -> None:
         self._stand = stand
-        self.heart: Heart = stand.heart
+        self.heartbeat: Heartbeat = stand.heartbeat
 
     def is_alive(self) -> bool:
         return self._stand.guardian.state is not State.DONE
 
-    def evict(self) -> None:
-        self._stand.guardian.retire()
+    def kill(self) -> None:
+        self._stand.guardian.stop()
 
-    def replace(self) -> None:
+    def begin_replacement(self) -> None:
         raise NotImplementedError
 
-    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+    def stop(self, is_interrupted: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         raise NotImplementedError
 
-    def came_up(self) -> bool:
+    def finish_replacement(self) -> bool:
         raise NotImplementedError
 
 
@@ -57,10 +57,12 @@ class Stand:
         line.attach(0x0C, self.dac)
         bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
         lossy = FaultI2c(bus, self.clock, FaultPlan(loss=loss, seed=3))
-        self.heart = Heart()
-        self.heart.watch(self.clock.now_ns())
+        self.heartbeat = Heartbeat()
+        self.heartbeat.note_guardian_alive(self.clock.now_ns())
         self.amplifier = GuardedAmplifier(DacAmplifier(bus, self.clock), Held(self), self.clock, lease_ms=40.0)
-        self.guardian = Guardian(self.heart, DacAmplifier(lossy, self.clock), self.clock, notice_ms=8.0, limit_ms=41.0)
+        self.guardian = Guardian(
+            self.heartbeat, DacAmplifier(lossy, self.clock), self.clock, notice_ms=8.0, limit_ms=41.0
+        )
 
     def moving(self) -> None:
         """Armed and out at ``FAR``."""
@@ -87,7 +89,7 @@ def test_a_beating_firmware_is_left_alone():
         stand.tick()
     assert len(stand.path) == before
     assert stand.guardian.report()["why"] == "nothing"
-    assert stand.heart.noticed_ns == 0
+    assert stand.heartbeat.late_beat_ns == 0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.5])
@@ -117,15 +119,15 @@ def test_a_firmware_that_dies_at_rest_needs_nothing():
 def test_a_pause_is_noticed_and_a_long_one_taken_over_and_the_firmware_gives_in():
     stand = Stand()
     stand.moving()
-    beat_ns = stand.heart.beat_ns
+    beat_ns = stand.heartbeat.beat_ns
     for _ in range(30):
         stand.tick()
-    assert 8 * MS < stand.heart.noticed_ns - beat_ns <= 10 * MS
-    assert not stand.heart.taken_ns
+    assert 8 * MS < stand.heartbeat.late_beat_ns - beat_ns <= 10 * MS
+    assert not stand.heartbeat.taken_ns
     for _ in range(40):
         stand.tick()
-    assert stand.heart.why is Why.SILENT
-    assert 41 * MS < stand.heart.taken_ns - beat_ns <= 43 * MS
+    assert stand.heartbeat.reason is TakeoverReason.SILENT
+    assert 41 * MS < stand.heartbeat.taken_ns - beat_ns <= 43 * MS
     assert stand.volts() == pytest.approx([50.0] * 3)
     with pytest.raises(SafetyTrip, match=r"stood still for [67]\d ms"):
         stand.amplifier.write(FAR)
@@ -142,13 +144,13 @@ def test_a_pause_is_noticed_and_a_long_one_taken_over_and_the_firmware_gives_in(
 def test_a_firmware_that_wakes_during_the_ramp_waits_for_its_end():
     stand = Stand()
     stand.moving()
-    while not stand.heart.taken_ns:
+    while not stand.heartbeat.taken_ns:
         stand.tick()
     stand.tick()
     written = len(stand.path)
     assert not stand.amplifier.safe_step()
     assert len(stand.path) == written
-    while not stand.heart.reached_ns:
+    while not stand.heartbeat.neutral_ns:
         stand.tick()
     assert stand.amplifier.safe_step()
 
@@ -156,7 +158,7 @@ def test_a_firmware_that_wakes_during_the_ramp_waits_for_its_end():
 def test_a_command_that_was_under_way_is_undone():
     stand = Stand()
     stand.moving()
-    while not stand.heart.reached_ns:
+    while not stand.heartbeat.neutral_ns:
         stand.tick(alive=False)
     late = DacAmplifier(stand.guardian._output.bus, stand.clock)  # type: ignore[attr-defined]
     late.arm()
@@ -180,17 +182,17 @@ def test_a_dead_bus_ends_in_a_report():
 
 def test_arming_is_not_silence_and_rest_after_the_ramp_is_not_either():
     stand = Stand()
-    stand.heart.say(Phase.ARMING)
+    stand.heartbeat.set_phase(Phase.ARMING)
     for _ in range(100):
         stand.tick()
-    assert stand.heart.why is Why.NOTHING
+    assert stand.heartbeat.reason is TakeoverReason.NOTHING
     stand.moving()
     while not stand.amplifier.safe_step():
         stand.tick()
-    assert stand.heart.phase is Phase.IDLE
+    assert stand.heartbeat.phase is Phase.IDLE
     for _ in range(100):
         stand.tick()
-    assert stand.heart.why is Why.NOTHING
+    assert stand.heartbeat.reason is TakeoverReason.NOTHING
 
 
 def test_a_refused_command_is_a_beat_too():
@@ -199,16 +201,16 @@ def test_a_refused_command_is_a_beat_too():
     stand.dac.nack_address = True
     with pytest.raises(I2cNack):
         stand.amplifier.write(FAR)
-    assert stand.heart.beat_ns <= stand.clock.now_ns()
-    assert stand.clock.now_ns() - stand.heart.beat_ns < MS
+    assert stand.heartbeat.beat_ns <= stand.clock.now_ns()
+    assert stand.clock.now_ns() - stand.heartbeat.beat_ns < MS
 
 
 def test_shared_memory_is_seen_through_its_descriptor():
-    ours = Heart.shared()
+    ours = Heartbeat.shared()
     assert ours.fd is not None
-    theirs = Heart(ours.fd)
+    theirs = Heartbeat(ours.fd)
     ours.beat(12345678901234567)
-    ours.say(Phase.RUNNING)
+    ours.set_phase(Phase.RUNNING)
     assert (theirs.beat_ns, theirs.phase) == (12345678901234567, Phase.RUNNING)
-    theirs.take(Why.SILENT, 7)
-    assert (ours.taken_ns, ours.why) == (7, Why.SILENT)
+    theirs.take_outputs(TakeoverReason.SILENT, 7)
+    assert (ours.taken_ns, ours.reason) == (7, TakeoverReason.SILENT)

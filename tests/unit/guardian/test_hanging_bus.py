@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.guardian.guardian import State
-from firmware_py.guardian.heart import Why
+from firmware_py.guardian.heartbeat import TakeoverReason
 from hal.errors import BusError, HalError
 from hal.middleware.faults import FaultPlan
 from tests.unit.guardian.test_exclusive import FAR_V, MS, Stand, alternating
@@ -81,7 +81,7 @@ def test_the_firmware_takes_the_outputs_of_a_guardian_that_does_nothing_on_a_bus
 
 
 def test_a_hang_in_the_firmware_s_own_ramp_is_taken_over_and_brought_to_neutral():
-    """The firmware's transfers fail without a pause; its heart beats on until it tries less often than its lease."""
+    """The firmware's transfers fail without a pause; its heartbeat goes on until the pauses exceed the lease."""
     stand = HangingStand()
     stand.run(5, lambda k: FAR_V)
     stand.hang()
@@ -116,7 +116,7 @@ def test_a_read_that_waited_for_the_bus_gives_the_guardian_its_time(slow_ms: int
 def test_the_firmware_s_own_ramp_after_it_ended_a_guardian_that_had_taken_the_outputs_takes_its_sixteen_steps():
     stand = HangingStand(guardian_steps=False)
     stand.run(5)
-    stand.heart.take(Why.SILENT, stand.clock.now_ns())  # and then it stands still
+    stand.heartbeat.take_outputs(TakeoverReason.SILENT, stand.clock.now_ns())  # and then it stands still
     stand.clock.burn_ns(50 * MS)
     said = stand.pass_ms(100)
     assert said == ["neutral"]

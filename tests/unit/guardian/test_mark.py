@@ -13,8 +13,8 @@ import pytest
 
 from drivers.piezo.dac_amplifier import DacAmplifier
 from firmware_py.guardian.guardian import Guardian, State
-from firmware_py.guardian.heart import Heart, Phase, Why
-from firmware_py.guardian.process import serve
+from firmware_py.guardian.heartbeat import Heartbeat, Phase, TakeoverReason
+from firmware_py.guardian.process import run_guardian
 from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
 from sim_devices.devices.ad5696r import Ad5696r
@@ -22,9 +22,9 @@ from sim_devices.transports.i2c_line import I2cLine
 
 OWNER = """
 import sys, time
-from firmware_py.guardian.heart import Heart
-heart = Heart(int(sys.argv[1]))
-assert heart.mark.hold()
+from firmware_py.guardian.heartbeat import Heartbeat
+heartbeat = Heartbeat(int(sys.argv[1]))
+assert heartbeat.mark.hold()
 ballast = bytearray(80_000_000)
 print("holds", flush=True)
 time.sleep(600.0)
@@ -32,17 +32,17 @@ time.sleep(600.0)
 
 
 class Owner:
-    """A process that holds the mark of ``heart`` and the writing end of ``pipe``, beside much memory."""
+    """A process that holds the mark of ``heartbeat`` and the writing end of ``pipe``, beside much memory."""
 
     def __init__(self) -> None:
-        self.heart = Heart.shared()
-        assert self.heart.fd is not None
+        self.heartbeat = Heartbeat.shared()
+        assert self.heartbeat.fd is not None
         self.pipe, theirs = os.pipe()
         interpreter = child_command("x")[0]
         self._process = subprocess.Popen(
-            [interpreter, "-c", OWNER, str(self.heart.fd)],
+            [interpreter, "-c", OWNER, str(self.heartbeat.fd)],
             stdout=subprocess.PIPE,
-            pass_fds=(self.heart.fd, theirs),
+            pass_fds=(self.heartbeat.fd, theirs),
             env=child_environment(),
         )
         os.close(theirs)
@@ -68,9 +68,9 @@ def owner():
 
 
 def test_the_mark_is_set_before_the_pipe_closes(owner: Owner):
-    assert not owner.heart.mark.owner_died
+    assert not owner.heartbeat.mark.owner_died
     owner.kill()
-    assert owner.heart.mark.owner_died
+    assert owner.heartbeat.mark.owner_died
 
 
 def test_the_guardian_answers_to_the_mark_although_the_pipe_stays_open(owner: Owner):
@@ -95,13 +95,13 @@ def test_the_guardian_answers_to_the_mark_although_the_pipe_stays_open(owner: Ow
     amplifier.arm()
     while amplifier.commanded_V[0] < 60.0:
         amplifier.write(np.array([70.0, 30.0, 50.0]))
-    guardian = Guardian(owner.heart, DacAmplifier(Immediate(), clock), clock, notice_ms=1e6, limit_ms=1e6)  # type: ignore[arg-type]
-    owner.heart.say(Phase.RUNNING)
-    owner.heart.beat(clock.now_ns())
+    guardian = Guardian(owner.heartbeat, DacAmplifier(Immediate(), clock), clock, notice_ms=1e6, limit_ms=1e6)  # type: ignore[arg-type]
+    owner.heartbeat.set_phase(Phase.RUNNING)
+    owner.heartbeat.beat(clock.now_ns())
     never_closed, writer = os.pipe()
     owner.kill()
-    serve(guardian, owner.heart, clock, never_closed)
-    assert (guardian.state, owner.heart.why) == (State.DONE, Why.DIED)
+    run_guardian(guardian, owner.heartbeat, clock, never_closed)
+    assert (guardian.state, owner.heartbeat.reason) == (State.DONE, TakeoverReason.DIED)
     assert [round(20.0 * volts, 2) for volts in dac.output_V[:3]] == [50.0] * 3
     for descriptor in (never_closed, writer):
         os.close(descriptor)
@@ -109,21 +109,21 @@ def test_the_guardian_answers_to_the_mark_although_the_pipe_stays_open(owner: Ow
 
 @pytest.mark.parametrize("dies", [True, False])
 def test_a_thread_that_ends_with_the_mark_is_dead_and_one_that_released_it_is_not(dies: bool):
-    heart = Heart.shared()
+    heartbeat = Heartbeat.shared()
 
     def work() -> None:
-        assert heart.mark.hold()
+        assert heartbeat.mark.hold()
         if not dies:
-            heart.mark.release()
+            heartbeat.mark.release()
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
     deadline_s = time.monotonic() + 60.0
-    while dies and not heart.mark.owner_died and time.monotonic() < deadline_s:
+    while dies and not heartbeat.mark.owner_died and time.monotonic() < deadline_s:
         time.sleep(0.001)  # the thread of the system ends a little after Python's
-    assert heart.mark.owner_died is dies
+    assert heartbeat.mark.owner_died is dies
 
 
 def test_in_private_memory_nobody_dies():
-    assert not Heart().mark.owner_died
+    assert not Heartbeat().mark.owner_died

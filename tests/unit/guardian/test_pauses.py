@@ -7,7 +7,7 @@ import random
 import pytest
 
 from firmware_py.guardian.guardian import STEP_NS
-from firmware_py.guardian.process import LOOK_NS, pause_ns
+from firmware_py.guardian.process import STEP_DELAY_NS, compute_pause_ns
 
 STEP_COST_NS = 45_000
 """From the end of a pause to the begin of the next one: the process wakes late, and a step takes time."""
@@ -15,7 +15,7 @@ STEP_COST_NS = 45_000
 
 def test_no_pause_is_longer_than_a_step_or_shorter_than_half_of_one():
     beats = (0, 7_000_000, 9_000_000, *range(5_000_000, 7_000_000, 9_973))
-    pauses = [pause_ns(beat_ns, 7_000_000) for beat_ns in beats]
+    pauses = [compute_pause_ns(beat_ns, 7_000_000) for beat_ns in beats]
     assert max(pauses) <= STEP_NS
     assert min(pauses) >= STEP_NS // 2
 
@@ -28,9 +28,9 @@ def test_steps_come_while_the_loop_waits_for_its_bus(offset_ns: int):
     now_ns, after_ns = offset_ns, list[int]()
     while now_ns < beats[-1]:
         beat_ns = max((beat for beat in beats if beat <= now_ns), default=0)
-        now_ns += pause_ns(beat_ns, now_ns)
+        now_ns += compute_pause_ns(beat_ns, now_ns)
         after_ns.append(now_ns - max(beat for beat in beats if beat <= now_ns))
         now_ns += STEP_COST_NS
     settled = after_ns[20:]
     assert len(settled) > 30
-    assert all(abs(each - LOOK_NS) < 130_000 for each in settled), settled
+    assert all(abs(each - STEP_DELAY_NS) < 130_000 for each in settled), settled

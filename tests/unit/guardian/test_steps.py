@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.guardian.gate import LeaseGate
-from firmware_py.guardian.guardian import CLAIM_NS, HOLD_NS, LONGEST_PAUSE_NS, RETRY_S, STEP_NS, Guardian, State
-from firmware_py.guardian.heart import Heart, Order, Phase, Why
+from firmware_py.guardian.guardian import HOLD_NS, LONGEST_PAUSE_NS, RETRY_S, STEP_NS, STUCK_COMMAND_NS, Guardian, State
+from firmware_py.guardian.heartbeat import Heartbeat, Phase, TakeoverReason
 from hal.clock import VirtualClock
 from hal.errors import HalError, HalTimeout, I2cNack, SafetyTrip
+from tests.unit.guardian.handle import begin_command
 
 MS = 1_000_000
 START_NS = 7_000 * MS
-ORDER = Order((1, 2, 3), repeats=False)
 
 
 class Output:
@@ -47,12 +47,17 @@ class Stand:
     def __init__(self, output: Output) -> None:
         self.clock = VirtualClock()
         self.clock.burn_ns(START_NS)
-        self.heart, self.output, self.ended = Heart(), output, 0
+        self.heartbeat, self.output, self.ended = Heartbeat(), output, 0
         self.guardian = Guardian(
-            self.heart, output, self.clock, notice_ms=8.0, limit_ms=41.0, end=lambda: setattr(self, "ended", 1)
+            self.heartbeat,
+            output,
+            self.clock,
+            notice_ms=8.0,
+            limit_ms=41.0,
+            kill_firmware=lambda: setattr(self, "ended", 1),
         )
-        self.heart.say(Phase.RUNNING)
-        self.heart.beat(START_NS)
+        self.heartbeat.set_phase(Phase.RUNNING)
+        self.heartbeat.beat(START_NS)
 
     def pass_ms(self, count: int, *, alive: bool = True) -> None:
         for _ in range(count):
@@ -107,14 +112,14 @@ def test_a_bus_that_comes_back_within_the_time_is_ramped_and_confirmed(hangs_ms:
     stand.pass_ms(LONGEST_PAUSE_NS // MS + 3, alive=False)
     assert stand.guardian.state is State.HOLDING
     assert stand.guardian.problem == ""
-    assert stand.heart.reached_ns
+    assert stand.heartbeat.neutral_ns
 
 
 def test_it_holds_for_as_long_as_the_firmware_lives_and_has_not_given_in() -> None:
     stand = Stand(Output(steps=1))
     stand.pass_ms(500)
-    assert (stand.heart.why, stand.guardian.state) == (Why.SILENT, State.HOLDING)
-    stand.heart.say(Phase.IDLE)
+    assert (stand.heartbeat.reason, stand.guardian.state) == (TakeoverReason.SILENT, State.HOLDING)
+    stand.heartbeat.set_phase(Phase.IDLE)
     stand.pass_ms(1)
     assert stand.guardian.state is State.DONE
 
@@ -130,12 +135,12 @@ def test_it_holds_for_fifty_ms_after_a_death() -> None:
 def test_while_the_bus_answers_nobody_the_firmware_is_not_ended_for_a_command_that_waits() -> None:
     """Its transfer hangs, as the guardian's read does: it does not stand still."""
     stand = Stand(Output(deaf=True))
-    stand.heart.enter(ORDER)
-    while not stand.heart.taken_ns:
+    begin_command(stand.heartbeat, (1, 2, 3))
+    while not stand.heartbeat.taken_ns:
         stand.pass_ms(1)
     stand.pass_ms(3000)
     assert (stand.guardian.state, stand.ended) == (State.CLAIMING, 0)
-    stand.heart.leave()  # the transfer ran into its time limit
+    stand.heartbeat.end_command()  # the transfer ran into its time limit
     stand.pass_ms(1)
     assert stand.guardian.state is State.RAMPING
     stand.output.deaf = False
@@ -145,10 +150,10 @@ def test_while_the_bus_answers_nobody_the_firmware_is_not_ended_for_a_command_th
 
 def test_when_the_bus_is_back_a_command_that_has_not_arrived_ends_the_firmware() -> None:
     stand = Stand(Output(deaf=True))
-    stand.heart.enter(ORDER)
-    while not stand.heart.taken_ns:
+    begin_command(stand.heartbeat, (1, 2, 3))
+    while not stand.heartbeat.taken_ns:
         stand.pass_ms(1)
-    stand.pass_ms(3 + CLAIM_NS // MS)
+    stand.pass_ms(3 + STUCK_COMMAND_NS // MS)
     assert stand.ended == 0
     stand.output.deaf = False
     stand.pass_ms(1 + LONGEST_PAUSE_NS // MS)
@@ -172,10 +177,10 @@ class Gate:
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.clock.burn_ns(START_NS)
-        self.heart = Heart()
-        self.gate = LeaseGate(self.heart, self.clock, "piezo", 40.0)
-        self.heart.say(Phase.RUNNING)
-        self.heart.beat(START_NS)
+        self.heartbeat = Heartbeat()
+        self.gate = LeaseGate(self.heartbeat, self.clock, "piezo", 40.0)
+        self.heartbeat.set_phase(Phase.RUNNING)
+        self.heartbeat.beat(START_NS)
 
 
 def test_a_lease_lasts_to_its_last_moment_and_every_command_renews_it() -> None:
@@ -183,7 +188,7 @@ def test_a_lease_lasts_to_its_last_moment_and_every_command_renews_it() -> None:
     for _ in range(2):
         g.clock.burn_ns(40 * MS)
         g.gate.enter((1, 2, 3))
-        assert g.heart.inside is not None
+        assert g.heartbeat.command_in_flight is not None
         g.gate.leave()
     assert g.gate.lost is False
 
@@ -195,12 +200,12 @@ def test_a_lease_that_is_over_stays_over() -> None:
         with pytest.raises(SafetyTrip, match="has lost the outputs") as caught:
             g.gate.enter((1, 2, 3))
         assert caught.value.device == "piezo"
-        assert (g.heart.inside, g.heart.phase, g.gate.lost) == (None, Phase.YIELDED, True)
+        assert (g.heartbeat.command_in_flight, g.heartbeat.phase, g.gate.lost) == (None, Phase.YIELDED, True)
 
 
 def test_nothing_goes_out_once_the_guardian_has_the_outputs() -> None:
     g = Gate()
-    g.heart.take(Why.SILENT, START_NS)
+    g.heartbeat.take_outputs(TakeoverReason.SILENT, START_NS)
     with pytest.raises(SafetyTrip):
         g.gate.enter((1, 2, 3))
 
@@ -210,9 +215,9 @@ def test_who_is_alone_needs_no_lease() -> None:
     g.clock.burn_ns(41 * MS)
     with pytest.raises(SafetyTrip):
         g.gate.enter((1, 2, 3))
-    g.gate.regain()
+    g.gate.drop_lease()
     assert g.gate.lost is False
-    g.heart.say(Phase.RUNNING)
+    g.heartbeat.set_phase(Phase.RUNNING)
     g.gate.enter((1, 2, 3))
 
 
@@ -221,8 +226,8 @@ def test_a_command_says_whether_it_repeats_the_one_before() -> None:
     seen = []
     for codes in ((0, 0, 0), (0, 0, 0), (0, 0, 1), (0, 0, 0)):
         g.gate.enter(codes)
-        assert g.heart.inside is not None
-        seen.append(g.heart.inside)
+        assert g.heartbeat.command_in_flight is not None
+        seen.append(g.heartbeat.command_in_flight)
         g.gate.leave()
     assert [order.repeats for order in seen] == [False, True, False, False]
     assert seen[2].codes == (0, 0, 1)

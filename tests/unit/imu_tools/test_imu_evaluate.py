@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from firmware_py.endoscope.wiring import open_sensors
+from hal.arrays import Array
 from hal.bench import load_bench, open_bench
 from hal.errors import BenchError
 from tools.cli.main import app
@@ -22,7 +22,6 @@ from tools.imu.series import Scales, Series, join_series, load_series
 from tools.imu.stability import stability
 from tools.imu.thermal import thermal
 
-Array = NDArray[np.float64]
 RATE_HZ = 100.0
 
 

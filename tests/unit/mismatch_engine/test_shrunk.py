@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
+from hal.arrays import Array
 from tools.mismatch.engine.projected import evidence
-
-Array = NDArray[np.float64]
 
 
 def none(size: Array) -> Array:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tests.unit.mismatch_model.test_cascade import circuit, in_two
@@ -26,7 +26,6 @@ from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 from tools.toml_text import toml_text
 
-Array = NDArray[np.float64]
 N, DT = 1500, 0.01
 FILE_UNITS = {"um": "nm", "m": "mm", "V": "mV", "rad": "deg"}
 """Files are in other units than the twins."""

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from hal import plugins
+from hal.arrays import Array
 from hal.trust import trust_package
 from sim_devices.physics import hysteresis
 from sim_devices.physics.catalogue import EFFECTS
@@ -35,7 +35,6 @@ from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 
-Array = NDArray[np.float64]
 N, DT = 320, 4e-3
 
 

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.recording import Recording, Split, TwinText
-
-Array = NDArray[np.float64]
 
 
 def recording(

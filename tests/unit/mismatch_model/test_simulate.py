@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.errors import RecordingError
@@ -21,7 +21,6 @@ from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.make import make
 
-Array = NDArray[np.float64]
 N, DT = 1200, 2e-3
 
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import StateSpace, dlsim, lsim
 
+from hal.arrays import Array
 from hal.trust import NotTrusted, trust_package
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING
@@ -38,7 +38,6 @@ from tools.mismatch.twins.linear import (
 )
 from tools.mismatch.twins.make import make
 
-Array = NDArray[np.float64]
 AXIS = {"force": "N", "position": "m", "velocity": "m/s"}
 
 

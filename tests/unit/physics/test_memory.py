@@ -7,13 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
 from sim_devices.physics.hysteresis import dahl, relays, risen, stops
 
-Array = NDArray[np.float64]
 ONE = np.zeros(1, np.int64)
 
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.signal import lsim
 
+from hal.arrays import Array
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.curve import curve_basis
 from sim_devices.physics.dropped_samples import best_shifts, find_drops, shift_by, shift_costs
@@ -23,7 +23,6 @@ from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.saturation import limit
 from sim_devices.physics.slew import slew
 
-Array = NDArray[np.float64]
 ONE = np.zeros(1, np.int64)
 DT = 1e-3
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 from scipy.spatial.transform import Rotation
 
 from firmware_py.frame import COUNTS, LAYOUT, MAGNETOMETER_FRESH, MAGNETOMETER_RAW, TICK
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 GRAVITY = 9.80131
 POSITIONS = np.array([[0.0059, -0.0143, 0.0], [-0.0143, 0.0059, 0.0], [0.0, 0.0, 0.116]])[[0, 0, 1, 1, 2, 2]]
 AXES = np.eye(3)[[0, 2, 1, 2, 0, 1]]

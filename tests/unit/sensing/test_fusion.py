@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from firmware_py.records import attributes, new
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
 from firmware_py.sensing.quaternion import from_matrix
+from hal.arrays import Array
 from tools.research.endoscope import published_filters
 from tools.research.reproduce.broad_trials import read_trial
 from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 
-Array = NDArray[np.float64]
 RATE_HZ = 100.0
 FILTERS = ["tilt", "gyroscope", "complementary", "madgwick", "mahony"]
 

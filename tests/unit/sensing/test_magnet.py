@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from firmware_py.records import Records, attributes, new
@@ -12,8 +11,8 @@ from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.error_state_records import ErrorStateParams
 from firmware_py.sensing.gyroscope_filter import GyroscopeMemory, begin_gyroscope, run_gyroscope
 from firmware_py.sensing.magnet import UNKNOWNS, Magnet, MagnetParams, begin_magnet, find_magnet, heading_spread
+from hal.arrays import Array
 
-Array = NDArray[np.float64]
 RATE_HZ = 100.0
 ROOM_UT = np.array([16.0, 0.0, -42.0])
 MAGNET_UT = np.array([-1.5, 2.0, 2.5])

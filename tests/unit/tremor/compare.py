@@ -13,7 +13,8 @@ import numpy as np
 from firmware_py.frame import LAYOUT, STATUS, TICK, TIP_ACCELERATION, TREMOR_AHEAD
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
 from firmware_py.tremor.stage import Tremor, estimate_kernel
-from tests.unit.tremor.synthetic import KINDS, RATE_HZ, Array, make_record, residual_percent
+from hal.arrays import Array
+from tests.unit.tremor.synthetic import KINDS, RATE_HZ, make_record, residual_percent
 from tools.research.tremor.baselines import BASELINES
 
 HELD_OUT = range(100, 106)

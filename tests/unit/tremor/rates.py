@@ -10,18 +10,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
 from firmware_py.tremor.config import Method, TremorConfig
 from firmware_py.tremor.estimator import Estimator
+from hal.arrays import Array
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from tools.research.tremor.bound import bank_features, lift
 
-Array = NDArray[np.float64]
 SKIP_S = 5.0
 TO_COMMAND_S = 0.0016
 """From a scan to its command at the stroke; the middle of the hold, half a tick, comes on top (2.1 ms at 1 kHz)."""

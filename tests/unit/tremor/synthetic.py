@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, cont2discrete, lfilter, sosfilt, sosfiltfilt
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
+
 RATE_HZ = 1000.0
 GRAVITY = 9.80131
 CUTOFF_RAD_S = 1.0 / (32_000.0 * 0.33e-6)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, ellip, sosfilt, sosfreqz
 
+from firmware_py.biquads import cascade_response, cascade_step
 from firmware_py.records import attributes, new
 from firmware_py.tremor.combiner import (
     combiner_displacement,
@@ -15,7 +16,7 @@ from firmware_py.tremor.combiner import (
 )
 from firmware_py.tremor.config import TremorConfig, WflcConfig
 from firmware_py.tremor.flc import flc_step
-from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
+from firmware_py.tremor.prefilter import prefilter_sections
 from firmware_py.tremor.wflc import WflcState, wflc_params, wflc_step
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 
@@ -31,14 +32,14 @@ def locked_frequency_hz(signal: np.ndarray, config: WflcConfig) -> float:
     return float(np.mean(tail[-1000:])) * RATE_HZ / (2 * np.pi)
 
 
-def test_prefilter_response_is_scipys() -> None:
+def test_cascade_response_is_scipys() -> None:
     config = WflcConfig()
     sections = prefilter_sections(config, RATE_HZ)
     assert sections.shape == (3, 5)  # sixth order
     f = np.linspace(0.5, 100.0, 400)
     sos = ellip(3, config.ripple_dB, config.attenuation_dB, [7.0, 13.0], "bandpass", output="sos", fs=RATE_HZ)
     _, expected = sosfreqz(sos, worN=f, fs=RATE_HZ)
-    np.testing.assert_allclose(prefilter_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(cascade_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
     gain = np.abs(expected)
     assert np.all(gain[(f > 7.0) & (f < 13.0)] > 10 ** (-config.ripple_dB / 20) - 1e-6)
 
@@ -49,15 +50,15 @@ def test_a_butterworth_of_first_order_lets_all_pass_in_the_sections_it_does_not_
     assert sections.shape == (3, 5)
     f = np.linspace(0.5, 100.0, 400)
     _, expected = sosfreqz(butter(1, [6.0, 14.0], "bandpass", output="sos", fs=RATE_HZ), worN=f, fs=RATE_HZ)
-    np.testing.assert_allclose(prefilter_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(cascade_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_prefilter_steps_as_scipy_filters() -> None:
+def test_cascade_steps_as_scipy_filters() -> None:
     config = WflcConfig()
     sections = prefilter_sections(config, RATE_HZ)
     x = np.random.default_rng(0).standard_normal(500)
     memory = np.zeros((3, 2))
-    ours = [prefilter_step(v, memory, sections) for v in x]
+    ours = [cascade_step(v, memory, sections) for v in x]
     sos = np.insert(sections, 3, 1.0, axis=1)
     np.testing.assert_allclose(ours, sosfilt(sos, x), atol=1e-12)
 
@@ -113,7 +114,7 @@ def test_kernels_and_python_agree() -> None:
         s = 0.07 * np.sin(0.06 * k) + 0.01
         combiner_step(s, a[0], params[0])
         wflc_step.py_func(  # type: ignore[attr-defined]
-            prefilter_step.py_func(s, twin.memory, at.sections),  # type: ignore[attr-defined]
+            cascade_step.py_func(s, twin.memory, at.sections),  # type: ignore[attr-defined]
             twin.wflc,
             at.wflc,
         )

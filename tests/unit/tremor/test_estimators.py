@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from firmware_py.biquads import cascade_response
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
 from firmware_py.tremor.estimator import ROWS, Estimator, run_estimator
-from firmware_py.tremor.prefilter import prefilter_gain, prefilter_response, prefilter_sections
-from firmware_py.tremor.seen import seen_params, undo
+from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections
+from firmware_py.tremor.sensor_model import invert_sensor, sensor_params
 from tests.unit.allocations import allocations
 from tests.unit.tremor.estimator_state import peek, unfiltered
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
@@ -107,11 +108,11 @@ def test_sensor_factor_and_prefilter_gain_at_one_frequency() -> None:
     config = TremorConfig(loop_delay_s=0.003)
     hz = np.array([8.0, 11.0])
     sections = prefilter_sections(config.wflc, RATE_HZ)
-    for f, expected in zip(hz, prefilter_response(sections, hz, RATE_HZ), strict=True):
+    for f, expected in zip(hz, cascade_response(sections, hz, RATE_HZ), strict=True):
         w = 2 * np.pi * f
         assert prefilter_gain(sections, w / RATE_HZ) == pytest.approx(expected, rel=1e-9)
         seen = -(w**2) * CUTOFF_RAD_S / (1j * w + CUTOFF_RAD_S)
-        assert undo(w, 0.003, seen_params(config)[0]) == pytest.approx(np.exp(0.003j * w) / seen, rel=1e-9)
+        assert invert_sensor(w, 0.003, sensor_params(config)[0]) == pytest.approx(np.exp(0.003j * w) / seen, rel=1e-9)
 
 
 def test_horizon_is_filter_lag_and_loop_delay() -> None:

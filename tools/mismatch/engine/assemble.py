@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.checks import first_look
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.exported import raw_values, without_events
@@ -43,8 +43,6 @@ from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.ode import inside_of
-
-Array = NDArray[np.float64]
 
 
 def base_shifts(raw: Fit, base: Fit, fitted: Fit, deviations: Array) -> list[BaseShift]:

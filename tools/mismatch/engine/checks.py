@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.signal import correlate
 
+from hal.arrays import Array
 from tools.mismatch.engine.noise import lattice_step
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
@@ -16,8 +16,6 @@ from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make
 from tools.mismatch.units import sizes_beside
-
-Array = NDArray[np.float64]
 
 ALIKE = 1.06
 """Factor within which the slope of an output that follows its simulation counts as that of a unit."""

@@ -12,10 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.compiled import kernel
-
-Array = NDArray[np.float64]
-
 
 AT_ONCE = 2048  # number of samples that stay in the processor's first cache while all coefficients are applied
 

@@ -11,13 +11,12 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from hal.arrays import Array
 from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
 from tools.mismatch.engine.features import Feature
 
-Array = NDArray[np.float64]
 Span = tuple[int, int]
 
 

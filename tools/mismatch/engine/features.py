@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from hal.arrays import Array
 from hal.compiled import kernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from hal.arrays import Array
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected, Shrunk
 from tools.mismatch.engine.residual import residuals
@@ -21,8 +21,6 @@ from tools.mismatch.engine.trust import belief, fit_loss, stayed, to_search
 from tools.mismatch.placed import Free
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.ode import inside_of
-
-Array = NDArray[np.float64]
 
 LEAST_ROWS = 2000  # number of rows of a coarse search
 MOST_ROWS = 300_000  # largest number of rows of any search

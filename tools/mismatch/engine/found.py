@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.fit import Fit
@@ -18,8 +17,6 @@ from tools.mismatch.engine.vary import reduced
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.ode import inside_of
 from tools.numbers import rms
-
-Array = NDArray[np.float64]
 
 
 def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str, dict[str, ParameterValue]]:

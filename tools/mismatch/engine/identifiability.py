@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import Whitener, whiten
 from tools.mismatch.engine.fit import Fit
@@ -17,8 +17,6 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_start import starts as starts_of
-
-Array = NDArray[np.float64]
 
 EXPERIMENTS: dict[frozenset[str], str] = {
     frozenset(a.split()): b

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.mismatch.engine.colour import fit_whitener
 from tools.mismatch.engine.fit import Fit, moved_a_little
 from tools.mismatch.engine.problem import Problem
@@ -19,7 +20,6 @@ from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.trust import TIMES_GIVEN, TIMES_SCALE
 from tools.mismatch.simulate import Model
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.statistics import bounded_solution
 from tools.mismatch.engine.fit import Fit, at_bound, moved_a_little, put_away, search
 from tools.mismatch.engine.problem import Problem, spread
@@ -21,8 +22,6 @@ from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.screen import ROWS, Ground, Regression
 from tools.mismatch.engine.trust import belief, stayed, to_search
 from tools.mismatch.simulate import Model
-
-Array = NDArray[np.float64]
 
 COARSE_ROWS = 4000
 """Number of rows of the search of the effect's own parameters."""

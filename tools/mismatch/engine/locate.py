@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.dependence import Dependence, dependences, needs_memory
 from tools.mismatch.engine.features import (
     Feature,
@@ -21,8 +21,6 @@ from tools.mismatch.engine.features import (
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.windows import bad_windows
-
-Array = NDArray[np.float64]
 
 
 def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> tuple[Array, dict[str, Array], float]:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from hal.arrays import Array
 from tools.mismatch.engine.fit import Fit, fit, moved_a_little
 from tools.mismatch.engine.intervals import jacobian
 from tools.mismatch.engine.problem import Problem
@@ -20,8 +20,6 @@ from tools.mismatch.engine.workers import mapped
 from tools.mismatch.recording import Condition, Part, Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
-
-Array = NDArray[np.float64]
 
 MOST_FOLDS = 20
 """Largest number of folds of the held-out score. More recordings are left out in groups, so that the computing time

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.signal import welch
 
+from hal.arrays import Array
 from sim_devices.physics.periods import ALIKE, period_of
 from sim_devices.physics.statistics import runs
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ import itertools
 
 import numpy as np
 
+from hal.arrays import Array
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.report import Array, BaseShift, OneWay, ParameterValue
+from tools.mismatch.engine.report import BaseShift, OneWay, ParameterValue
 
 BLOCKS = 200
 BACKWARDS = 0.01

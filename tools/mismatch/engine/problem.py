@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.statistics import after_jumps
 from tools.mismatch.engine.noise import NoiseFloor, spectral_floor
 from tools.mismatch.engine.split import Span, Split
@@ -17,8 +18,6 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.statistics import bounded_solution
 from tools.mismatch.engine.problem import Problem, spread
 from tools.mismatch.engine.trust import belief, to_search
 from tools.mismatch.simulate import Model
-
-Array = NDArray[np.float64]
 
 HUBER = 4.0
 SHRUNK = 3

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from hal.jsonable import to_jsonable
 
-Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
 Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
 """Meaning of the verdict ``unexplained``; "" for the other verdicts."""

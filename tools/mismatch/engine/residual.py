@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.simulate import Model
-
-Array = NDArray[np.float64]
 
 
 def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[str] | None = None) -> dict[str, Array]:

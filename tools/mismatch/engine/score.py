@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import robust_scale
 
-Array = NDArray[np.float64]
 Span = tuple[int, int]
 
 CLIP = 30.0  # limit in robust scales; the same outlier in two models cancels in their difference

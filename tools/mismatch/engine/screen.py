@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from hal.arrays import Array
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Hint, Problem, spread
@@ -17,8 +18,6 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
 from tools.mismatch.twins.memo import Nearby
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

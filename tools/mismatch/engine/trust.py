@@ -11,13 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import Array
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.placed import Free
 from tools.mismatch.simulate import Model
-
-Array = NDArray[np.float64]
 
 LOG_WIDTH = 1.5
 """Standard deviation of the prior of a parameter that is searched by its logarithm: a factor of 4.5."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import Array
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.dependence import Dependence, dependences, follows_course
 from tools.mismatch.engine.features import Feature, alike, curve, rate_of, standard
@@ -15,8 +16,6 @@ from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.locate import follow, follow_size, tested_features, thinned
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import winsorised
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hal.arrays import Array
 
 
 def change_points(x: Array, penalty: float | None = None) -> list[int]:

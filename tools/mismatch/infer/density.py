@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from hal.arrays import Array
 from tools.mismatch.engine.features import curve, standard
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import robust_scale
 from tools.mismatch.placed import Placed
-
-Array = NDArray[np.float64]
 
 DEGREES = 5.0
 """Degrees of freedom of the density, as heavy-tailed noise has them."""

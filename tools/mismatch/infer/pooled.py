@@ -12,11 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from hal.arrays import Array
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.many import everything
 from tools.mismatch.engine.pose import Posed
-from tools.mismatch.engine.problem import Array, Problem
+from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.split import Split, cut, leave_out
 from tools.mismatch.engine.workers import mapped

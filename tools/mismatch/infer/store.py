@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from hal.arrays import Array
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.found import human_values
@@ -36,7 +37,6 @@ from tools.mismatch.infer.density import (
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
-Array = NDArray[np.float64]
 Part = tuple[str, ...]
 Key = frozenset[Part]
 

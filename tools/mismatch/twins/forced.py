@@ -10,14 +10,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import IntArray
 from sim_devices.physics.effect import Array
 from tools.mismatch.twins.base import Run
 from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 from tools.mismatch.twins.linear import run_states, start_state
 
-Integers = NDArray[np.int64]
 MOST_SHOTS = 12
 REPEATS = 1e-9
 """Change of a state over a period, relative to the largest state, below which it repeats."""
@@ -42,12 +41,12 @@ class ForcedRun:
     blocks: tuple[tuple[int, int], ...]
 
     @property
-    def starts(self) -> Integers:
+    def starts(self) -> IntArray:
         """Return the first sample of each stretch."""
         return np.array(self.run.starts, np.int64)
 
     @property
-    def ends(self) -> Integers:
+    def ends(self) -> IntArray:
         """Return the last sample + 1 of each stretch."""
         return np.array((*self.run.starts[1:], self.run.t.size), np.int64)
 
@@ -61,7 +60,7 @@ class ForcedRun:
         """Return the transition (s, s) over one sample."""
         return np.linalg.matrix_power(self.body.ad, self.body.sub)
 
-    def states(self, x0: Array, drive: Array, first: Integers, stop: Integers) -> Array:
+    def states(self, x0: Array, drive: Array, first: IntArray, stop: IntArray) -> Array:
         """Return states (n, s) from start states x0 (starts, s), with an input drive (n,)."""
         if self.forces is None:
             return run_states(self.body.ad, self.body.g0, self.body.g1, drive, x0, first)
@@ -110,10 +109,10 @@ class ForcedRun:
         return x0
 
 
-Go = Callable[[Array, Array, Integers, Integers], Array]
+Go = Callable[[Array, Array, IntArray, IntArray], Array]
 
 
-def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: Integers, period: int) -> Array | None:
+def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: IntArray, period: int) -> Array | None:
     """Find start states (starts, s) to which a run returns after ``period`` samples, by shooting from ``x0``.
 
     ``go(x0, u, starts, stops)`` returns states (n, s); ``full`` (s, s) is the linear plant over a period, which

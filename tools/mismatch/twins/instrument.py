@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from hal.arrays import Array
 from hal.bench import load_bench
 from hal.errors import BenchError
 from hal.trust import NotTrusted, path_inside
@@ -32,8 +32,6 @@ from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.units import convert, same_dimension
-
-Array = NDArray[np.float64]
 
 NODE_S = 1e-3
 NEUTRAL_V = 50.0

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hal.arrays import ComplexArray
 from sim_devices.physics.effect import Array
 
-Complex = NDArray[np.complex128]
 
-
-def typical_size(roots: Complex, span: float) -> float:
+def typical_size(roots: ComplexArray, span: float) -> float:
     """Return the typical size of some roots; companion states are scaled by its powers to be of one size."""
     sizes = np.abs(roots)
     sizes = sizes[sizes > 1e-9 * (sizes.max() if sizes.size else 1.0)]
@@ -37,7 +35,7 @@ class Mode:
         return 2 if self.kind == "pair" else 1
 
 
-def modes_of(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
+def modes_of(poles: ComplexArray, discrete: bool, dt: float) -> list[Mode]:
     """Return the modes of a set of poles that is closed under conjugation."""
     modes: list[Mode] = []
     size = max(float(np.max(np.abs(poles))), 1e-300) if poles.size else 1.0
@@ -61,7 +59,7 @@ def modes_of(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
     return modes
 
 
-def roots_of_mode(mode: Mode, discrete: bool, dt: float) -> Complex:
+def roots_of_mode(mode: Mode, discrete: bool, dt: float) -> ComplexArray:
     """Return the poles of a mode in s, or in z - 1 for a discrete twin.
 
     With the delta operator (G. C. Goodwin et al.) companion states stay distinct at any sampling rate.
@@ -72,7 +70,7 @@ def roots_of_mode(mode: Mode, discrete: bool, dt: float) -> Complex:
     return np.expm1(both * dt) if discrete else both
 
 
-def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Array]:
+def companion(roots: ComplexArray, omega: float, discrete: bool) -> tuple[Array, Array]:
     """Return companion form (s, s) and input (s,) of roots of s or z - 1, states scaled by powers of ``omega``."""
     s = roots.size
     if s == 2:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.arrays import ComplexArray
 from sim_devices.physics.effect import Array, Human, Parameter
 from sim_devices.physics.exponential import exponential
 from tools.errors import RecordingError
@@ -19,7 +20,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.holds import Holds, holds_text, read_holds
 from tools.mismatch.twins.linear import run_states
-from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, modes_of, roots_of_mode, typical_size
+from tools.mismatch.twins.modes import Mode, chains_of, companion, modes_of, roots_of_mode, typical_size
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
 MAX_ORDER = 64
@@ -65,7 +66,7 @@ class PoleBlocks:
             a[first:last, first:last], b[first:last] = companion(roots, size, self.discrete)
         return Plant(a, b, self.bounds if len(self.bounds) > 1 else ())
 
-    def _roots(self, i: int, theta: Array) -> Complex:
+    def _roots(self, i: int, theta: Array) -> ComplexArray:
         mode = self.modes[i]
         if mode.kind == "fixed":
             return roots_of_mode(mode, self.discrete, self.dt)
@@ -163,7 +164,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
     )
 
 
-def _pole_blocks(m: Matrices, poles: Complex, recording: Recording, start: _Start) -> PoleBlocks:
+def _pole_blocks(m: Matrices, poles: ComplexArray, recording: Recording, start: _Start) -> PoleBlocks:
     """Group the poles in blocks, and add the parameters of their modes to ``start``."""
     dt = recording.dt
     modes = modes_of(poles, m.discrete, dt)
@@ -311,7 +312,7 @@ def without_constant(m: Matrices, dt: float) -> Matrices:
     return replace(m, a=a, b=m.b[rest], c=m.c[:, rest], x0=m.x0[rest] - settled, y0=y0)
 
 
-def felt_poles(m: Matrices) -> Complex:
+def felt_poles(m: Matrices) -> ComplexArray:
     """Return the poles (closed under conjugation) of the observable modes: controllable ones first.
 
     A pole that several inputs move through copies of one block counts once.
@@ -371,7 +372,7 @@ SAME_POLE = 1e-6
 """Relative distance below which poles of different inputs are the same pole."""
 
 
-def _numerators(m: Matrices, plant: Plant, poles: Complex) -> dict[tuple[int, int], tuple[Array, float]]:
+def _numerators(m: Matrices, plant: Plant, poles: ComplexArray) -> dict[tuple[int, int], tuple[Array, float]]:
     """Return rows c with c (p - a)^-1 b equal to the given transfer function, per output and input.
 
     They are matched at points of the complex plane near every pole, where each mode is strongest.

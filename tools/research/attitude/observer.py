@@ -16,10 +16,11 @@ from math import atan2, exp, pi, sqrt
 
 import numpy as np
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnEntries
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.scratch import scratch
 

@@ -16,12 +16,13 @@ from math import radians, sqrt
 
 import numpy as np
 
-from firmware_py.records import Array, Records, field, new, record
+from firmware_py.records import Records, field, new, record
 from firmware_py.sensing.attitude_filter import AttitudeFilter, AttitudeParams, AttitudeState, Motion, OwnEntries
 from firmware_py.sensing.attitude_params import alpha_drift_densities, heading_density, motion_densities
 from firmware_py.sensing.config import DRIFT_S, SensingConfig
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.compiled import kernel
 
 

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.records import Array, Record, Records, field, new, record
+from firmware_py.records import Record, Records, field, new, record
 from firmware_py.sensing.fusion import FusionConfig, FusionFilter
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.triad import triad
+from hal.arrays import Array
 from hal.compiled import kernel
 
 TILT, GYROSCOPE, COMPLEMENTARY, MADGWICK, MAHONY = 0, 1, 2, 3, 4

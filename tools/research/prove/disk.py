@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from hal.arrays import Array
 from tools.research.prove import guests
 from tools.research.prove.draw import Case
-from tools.research.prove.forms_memory import Array, Rng
+from tools.research.prove.forms_memory import Rng
 
 # other units of one dimension: value in this unit = value in the contract's unit * factor + shift
 UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {

@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import bilinear, fftconvolve, lfilter, lfilter_zi
 
+from hal.arrays import Array
 from tools.research.prove import kernels
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 Transform = Callable[[Array, float, float], Array]
 

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from tools.research.prove.forms_memory import Array, Rng
+from hal.arrays import Array
+from tools.research.prove.forms_memory import Rng
 from tools.research.prove.plants import AXES, Bound, Flow, Scene, per_output
 from tools.research.prove.ports import added, pick_outputs, spans, zero_level
 

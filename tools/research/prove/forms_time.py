@@ -8,7 +8,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-from tools.research.prove.forms_memory import Array, Rng
+from hal.arrays import Array
+from tools.research.prove.forms_memory import Rng
 from tools.research.prove.plants import Bound, Flow, Scene, Signals
 from tools.research.prove.ports import added, pick_outputs, spans
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.research.prove.forms_memory import Array, Rng
+from hal.arrays import Array
+from tools.research.prove.forms_memory import Rng
 from tools.research.prove.plants import Bound, Flow, Scene
 from tools.research.prove.ports import added, main_drive, zero_level
 

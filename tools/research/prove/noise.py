@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from tools.research.prove.forms_memory import Array, Rng
+from hal.arrays import Array
+from tools.research.prove.forms_memory import Rng
 
 KINDS = ("white", "coloured", "heavy_tailed", "quantised")
 

@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from hal.arrays import Array
 from tools.research.prove import guests, kernels
 from tools.research.prove.plants_bench import run_bench
 
-Array = NDArray[np.float64]
 Signals = dict[str, Array]
 
 AXES = ("x", "y", "z")

@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from hal.arrays import Array
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
 
-Array = NDArray[np.float64]
 MILLISECOND_NS = 1_000_000
 
 

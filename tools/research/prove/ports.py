@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.research.prove.forms_memory import SHAPES, Array, Rng, lti
+from hal.arrays import Array
+from tools.research.prove.forms_memory import SHAPES, Rng, lti
 from tools.research.prove.plants import Bound, Flow, Scene, per_output, simulate
 
 STAGES_DRIVE = ("amplifier", "actuator", "mechanics", "acquisition")

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from hal.arrays import Array
 from tools.research.prove import excite, guests
 from tools.research.prove.catalog import BODY, SCALAR_ALL, VECTOR_ALL
-from tools.research.prove.forms_memory import Array, Rng
+from tools.research.prove.forms_memory import Rng
 from tools.research.prove.plants import AXES, Scene, Signals, held_step
 
 # context signals of the contract, section 2, with a level and a swing (contract unit)

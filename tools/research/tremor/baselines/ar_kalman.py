@@ -13,11 +13,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from firmware_py.biquads import cascade_response, cascade_step
 from firmware_py.sensing.translation import integrator_sections
 from firmware_py.tremor.adaptive_design import sensor_response
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
-from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
+from firmware_py.tremor.prefilter import prefilter_sections
 from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
@@ -53,7 +54,7 @@ def chain_sections(config: TremorConfig) -> Array:
 def chain_gain_and_lag(config: TremorConfig) -> tuple[float, float]:
     """Gain and phase lag (s, within one period) from displacement to the predictor's input at the start frequency."""
     hz = np.array([config.wflc.start_hz])
-    response = prefilter_response(chain_sections(config), hz, config.tick_hz)[0] * sensor_response(config, hz)[0]
+    response = cascade_response(chain_sections(config), hz, config.tick_hz)[0] * sensor_response(config, hz)[0]
     return float(abs(response)), float((-np.angle(response) % (2.0 * pi)) / (2.0 * pi * hz[0]))
 
 
@@ -110,7 +111,7 @@ def _axis(memory: Array, order: int, ring: int) -> Memory:
 def _correct(sample: float, m: Memory, n: Array) -> None:
     """Process the present tick's sample: run the filters, then let both predictors learn."""
     at = int(m.steady[0]) % len(m.past)
-    x = prefilter_step(sample, m.filter, n[SCALARS : SCALARS + 5 * SECTIONS].reshape(SECTIONS, 5))
+    x = cascade_step(sample, m.filter, n[SCALARS : SCALARS + 5 * SECTIONS].reshape(SECTIONS, 5))
     m.past[at] = x
     m.steady[1] += n[8] * (x * x - m.steady[1])
     if m.steady[1] <= 0.0:

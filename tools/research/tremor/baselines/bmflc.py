@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from firmware_py.biquads import cascade_step
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
-from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sections, prefilter_step
-from firmware_py.tremor.seen import seen_params, undo
+from firmware_py.tremor.prefilter import SECTIONS, prefilter_gain, prefilter_sections
+from firmware_py.tremor.sensor_model import invert_sensor, sensor_params
 from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
@@ -98,7 +99,7 @@ def bmflc_numbers(config: TremorConfig) -> Array:
     """Return the numbers of ``Comb``, one after the other, for ``config.method``."""
     c = validate_table(BmflcConfig, config.own, "[firmware.tremor.own]")
     size, moves = comb_size(c), config.method == "ebmflc"
-    seen: Any = seen_params(config)[0]
+    seen: Any = sensor_params(config)[0]
     if not c.low_hz < c.high_hz < 0.5 * config.tick_hz or size > MOST:
         raise BenchError(f"bmflc: low_hz < high_hz < tick_hz / 2 and at most {MOST} frequencies are needed")
     scalars = [
@@ -155,8 +156,8 @@ def _tune(axis: Weights, comb: Comb) -> None:
         if comb.behind_prefilter:
             # a short memory smears the tremor over the comb; the band's middle is where it is
             behind = prefilter_gain(comb.sections, middle if comb.follow > 0.0 else omega)
-        axis.undo[r] = undo(omega * comb.tick_hz, 0.0, seen) / behind
-        axis.undo[size + r] = undo(omega * comb.tick_hz, comb.delay_s, seen) / behind
+        axis.undo[r] = invert_sensor(omega * comb.tick_hz, 0.0, seen) / behind
+        axis.undo[size + r] = invert_sensor(omega * comb.tick_hz, comb.delay_s, seen) / behind
 
 
 @kernel
@@ -200,7 +201,7 @@ def _correct(sample: float, axis: Weights, comb: Comb) -> None:
     """Process the sample of the present tick."""
     size, w, x = comb.size, axis.weights, axis.regressor
     if comb.behind_prefilter:
-        sample = prefilter_step(sample, axis.filter, comb.sections)
+        sample = cascade_step(sample, axis.filter, comb.sections)
     error = sample - w[2 * size]
     for r in range(size):
         x[2 * r], x[2 * r + 1] = axis.phasor[r].imag, axis.phasor[r].real

@@ -18,16 +18,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg as scipy_linalg  # pyright: ignore[reportMissingTypeStubs]
 
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.own import OwnEstimator
+from hal.arrays import Array
 from hal.compiled import kernel
 from hal.errors import BenchError
 from hal.validation import Positive, StrictTable, validate_table
 
-Matrix = NDArray[np.float64]
 linalg: Any = scipy_linalg  # without type stubs
 ORDER = 4  # states of a mode: x, v, u, du/dt
 MEMORY, NUMBERS = 128, 1024
@@ -56,16 +55,16 @@ class OscillatorModel:
     ``now`` and ``ahead`` are rows that give tremor x(t) and x(t + loop delay) in m.
     """
 
-    transition: Matrix
-    gain: Matrix
-    observe: Matrix
-    now: Matrix
-    ahead: Matrix
+    transition: Array
+    gain: Array
+    observe: Array
+    now: Array
+    ahead: Array
     error_rms_m: float  # of x(t), when the model is true
     n_modes: int
 
 
-def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Matrix, Matrix]:
+def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Array, Array]:
     """Continuous (A, Q) of one mode whose displacement has ``variance`` m^2."""
     w = 2.0 * np.pi * frequency_hz
     single = np.array([[0.0, 1.0], [-w * w, -2.0 * np.pi * bandwidth_hz]])
@@ -79,7 +78,7 @@ def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Ma
     return a, q * (variance / covariance[0, 0])
 
 
-def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
+def _discretise(a: Array, q: Array, dt: float) -> tuple[Array, Array]:
     """Return the exact transition and noise covariance over ``dt`` (Van Loan 1978)."""
     n = len(a)
     block = np.zeros((2 * n, 2 * n))
@@ -87,7 +86,7 @@ def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
     block[:n, n:] = q
     block[n:, n:] = a.T
     e = linalg.expm(block * dt)
-    transition: Matrix = np.asarray(e[n:, n:].T, dtype=np.float64)
+    transition: Array = np.asarray(e[n:, n:].T, dtype=np.float64)
     return transition, np.asarray(transition @ e[:n, n:], dtype=np.float64)
 
 
@@ -132,7 +131,7 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     return OscillatorModel(f, gain, c[0], now, ahead, float(np.sqrt(now @ posterior @ now)), m)
 
 
-def kalman_numbers(config: TremorConfig) -> Matrix:
+def kalman_numbers(config: TremorConfig) -> Array:
     """Return modes, drift, observe; last row, gain, now and ahead (``n`` each); and the modes' blocks (4, 4) each.
 
     The transition is block diagonal but for its last row, and kept so. States are balanced.
@@ -145,7 +144,7 @@ def kalman_numbers(config: TremorConfig) -> Matrix:
 
 
 @kernel
-def kalman_predict(state: Matrix, numbers: Matrix) -> None:
+def kalman_predict(state: Array, numbers: Array) -> None:
     """s <- F s for one axis, one tick; ``state`` (4 m + 2,)."""
     n = len(state)
     last = combine(state, numbers[FIRST : FIRST + n])
@@ -160,7 +159,7 @@ def kalman_predict(state: Matrix, numbers: Matrix) -> None:
 
 
 @kernel
-def kalman_correct(state: Matrix, measured: float, numbers: Matrix) -> None:
+def kalman_correct(state: Array, measured: float, numbers: Array) -> None:
     """s += K (y - C s): ``measured`` is the tip's acceleration m/s^2, behind the RC filter."""
     n = len(state)
     innovation = measured - numbers[2] * state[n - 1]
@@ -169,7 +168,7 @@ def kalman_correct(state: Matrix, measured: float, numbers: Matrix) -> None:
 
 
 @kernel
-def combine(state: Matrix, row: Matrix) -> float:
+def combine(state: Array, row: Array) -> float:
     """row . state"""
     total = 0.0
     for i in range(len(state)):
@@ -178,7 +177,7 @@ def combine(state: Matrix, row: Matrix) -> float:
 
 
 @kernel
-def kalman_step(memory: Matrix, numbers: Matrix, sample: float, have: bool, out: Matrix) -> None:
+def kalman_step(memory: Array, numbers: Array, sample: float, have: bool, out: Array) -> None:
     """Compute one tick of one axis; see ``OwnEstimator``."""
     n = ORDER * int(numbers[0]) + 2
     state = memory[:n]

@@ -1,4 +1,4 @@
-"""Converts what the sensor shows back to displacement at one frequency, by undoing the known amplitude and phase.
+"""Converts a sensor's samples to displacement at one frequency, by inverting its known gain and phase.
 
 A sensor sees the tip's displacement (or its second derivative) through the RC filter. At one frequency both are a
 complex factor; its inverse, turned on by the phase that passes in the loop's delay, takes the weights of a Fourier
@@ -16,8 +16,8 @@ from hal.compiled import kernel
 
 
 @record
-class Seen:
-    """The sensor and its filter, between the tip and the samples."""
+class SensorModel:
+    """Describes the sensor and its filter, between the tip and the samples."""
 
     tick_hz: float = field("Hz")
     lag_s: float = field("s")  # of the RC filter, 0 without one
@@ -25,10 +25,10 @@ class Seen:
     delay_s: float = field("s")  # of the loop
 
 
-def seen_params(config: TremorConfig) -> Records[Seen]:
-    """Return what ``config`` says of the sensor."""
+def sensor_params(config: TremorConfig) -> Records[SensorModel]:
+    """Return the kernels' parameters of the sensor."""
     return new(
-        Seen,
+        SensorModel,
         tick_hz=config.tick_hz,
         lag_s=1.0 / config.filter_cutoff_rad_s if isfinite(config.filter_cutoff_rad_s) else 0.0,
         accelerates=int(config.sees == "acceleration"),
@@ -37,9 +37,9 @@ def seen_params(config: TremorConfig) -> Records[Seen]:
 
 
 @kernel
-def undo(omega_rad_s: float, ahead_s: float, seen: Seen) -> complex:
-    """Factor from a sample's phasor to the displacement's phasor ``ahead_s`` later."""
-    factor = (1.0 + 1j * omega_rad_s * seen.lag_s) * exp(1j * omega_rad_s * ahead_s)
-    if seen.accelerates:
+def invert_sensor(omega_rad_s: float, ahead_s: float, sensor: SensorModel) -> complex:
+    """Return the factor from a sample's phasor to the displacement's phasor (m) ``ahead_s`` later."""
+    factor = (1.0 + 1j * omega_rad_s * sensor.lag_s) * exp(1j * omega_rad_s * ahead_s)
+    if sensor.accelerates:
         return -factor / (omega_rad_s * omega_rad_s)
     return factor
