@@ -36,6 +36,11 @@ def surprises(table: str, rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def unexplained(rows: Sequence[Row]) -> list[str]:
+    """Return the rows that are missed without a word on why."""
+    return [key for row, key in zip(rows, keys(rows), strict=True) if not (row.meets or row.why)]
+
+
 def outcomes(page: str) -> dict[str, bool]:
     """Return whether each row of a page that ``document`` made is met, by its key (``keys``)."""
     cells, _ = parts_of(page)
@@ -106,12 +111,16 @@ RECORDED: tuple[tuple[str, Callable[[], Sequence[Row]]], ...] = (
 
 @pytest.mark.parametrize(("table", "section"), QUICK)
 def test_outcomes_of_documents(table: str, section: Callable[[], Sequence[Row]]) -> None:
-    assert surprises(table, section()) == []
+    rows = section()
+    assert surprises(table, rows) == []
+    assert unexplained(rows) == []
 
 
 @pytest.mark.parametrize(("table", "section"), RECORDED)
 def test_outcomes_on_recordings(shared_data: Path, table: str, section: Callable[[], Sequence[Row]]) -> None:
-    assert surprises(table, section()) == []
+    rows = section()
+    assert surprises(table, rows) == []
+    assert unexplained(rows) == []
 
 
 @pytest.mark.slow
@@ -119,6 +128,7 @@ def test_outcomes_on_recordings(shared_data: Path, table: str, section: Callable
 def test_outcomes_of_whole_tables(name: str) -> None:
     rows = reproduce_table(name).rows
     assert surprises(name, rows) == []
+    assert unexplained(rows) == []
     if data_folder().is_dir():
         gone = set(expected_outcomes(name)) - set(keys(rows))
         assert {key for key in gone if not needs_public_trials(key)} == set()

@@ -96,7 +96,7 @@ def rows_not_given() -> list[Row]:
             errors[0],
             "lower",
             "recording",
-            why=f"{errors[0] / vqf[0]:.2f} x vqf",
+            why=f"{errors[0] / vqf[0]:.2f} x vqf; {_parts(errors, vqf)}",
         )
         for trial, errors, vqf in zip(every, ours, vqf_errors, strict=True)
         if vqf is not None
@@ -159,6 +159,12 @@ def _means(
     return found
 
 
+def _parts(ours: tuple[float, ...], vqf: tuple[float, ...] | None) -> str:
+    """Return where the error lies, ours and vqf's (total, heading, inclination in deg)."""
+    parts = f"heading {ours[1]:.2f}, inclination {ours[2]:.2f} deg"
+    return parts if vqf is None else f"{parts}; vqf {vqf[1]:.2f} and {vqf[2]:.2f}"
+
+
 def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None) -> list[Row]:
     condition = "gyroscope as rate source, error-state filter, one setting for all trials"
     peers = [
@@ -170,9 +176,6 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
             ("1.1 x vqf 2.1.2, run side by side", GOAL * vqf[0], ours[0], "total"),
             ("1.1 x vqf 2.1.2, run side by side", GOAL * vqf[2], ours[2], "inclination"),
         ]
-    parts = f"heading {ours[1]:.2f}, inclination {ours[2]:.2f} deg"
-    if vqf is not None:
-        parts += f"; vqf {vqf[1]:.2f} and {vqf[2]:.2f}"
     found = [
         Row(
             f"BROAD, {peer}",
@@ -183,7 +186,7 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
             value,
             "lower",
             "recording",
-            why=parts if what == "total" else "",
+            why=_parts(ours, vqf),
         )
         for peer, published, value, what in peers
     ]
@@ -216,12 +219,12 @@ def _chosen(every: list[Trial], vqf_errors: list[tuple[float, float, float] | No
     errors = np.array([[trial.errors_deg(attitude(trial, s))[0] for trial in every] for s in settings(factor)])
     unseen = [float(errors[chosen_without(errors, k), k]) for k in range(len(every))]
     found = _means(every, unseen, vqf_errors, f"setting chosen without the trial, within {factor:.2g}")
-    for trial, vqf, ours in zip(every, vqf_errors, unseen, strict=True):
+    for k, (trial, vqf, ours) in enumerate(zip(every, vqf_errors, unseen, strict=True)):
         limits = list(_best(trial).values())
-        ratio = ""
+        why = f"the best of these settings for this very trial has {errors[:, k].min():.2f} deg"
         if vqf is not None:
             limits.append(GOAL * vqf[0])
-            ratio = f"{ours / vqf[0]:.2f} x vqf"
+            why = f"{ours / vqf[0]:.2f} x vqf; {why}"
         if not limits:
             continue
         found.append(
@@ -235,7 +238,7 @@ def _chosen(every: list[Trial], vqf_errors: list[tuple[float, float, float] | No
                 ours,
                 "lower",
                 "recording",
-                why=ratio,
+                why=why,
             )
         )
     return found

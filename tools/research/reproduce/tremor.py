@@ -15,7 +15,7 @@ from tools.research.reproduce.recordings import data_folder
 from tools.research.reproduce.rows import Kind, Row, Table, build
 from tools.research.tremor.bound import wiener_bounds
 from tools.research.tremor.cases import RATE_HZ, Case, case_of, emulated_hand
-from tools.research.tremor.evaluate import ORACLE, OTHERS, Summary, evaluate, summarise, with_horizon
+from tools.research.tremor.evaluate import ORACLE, OTHERS, UNSEEN, Summary, evaluate, summarise, with_horizon
 from tools.research.tremor.published import published_case
 from tools.research.tremor.report_published import TUNED_ALONE, TUNED_MIXED, left, tuned
 from tools.research.tremor.scores import score
@@ -25,6 +25,8 @@ HANDS = (101, 102, 103)
 SEEDS = (201, 202, 203)
 LOOP_MS = 2
 LIFTED = "2-20 Hz behind a filter that lifts 8-12 Hz"
+PLAIN = "plain 2-20 Hz, limit fitted so"
+NOT_ASKED = "the method is asked to make 8 to 12 Hz small, not 2 to 20"
 HELD = "3 emulated hands of 30 s, sensor noise and voluntary motion in, seeds not tuned on"
 
 
@@ -36,6 +38,8 @@ def _emulated() -> list[Row]:
     cases = [emulated_hand(seed) for seed in HANDS]
     lines = summarise(evaluate(cases, ("adaptive", "kalman", "wflc_flc", "bmflc_kalman"), (0, LOOP_MS, 8)))
     rows: list[Row] = []
+    beside = _one(lines, "wflc_flc", LOOP_MS).band_percent
+    least = _one(lines, ORACLE, LOOP_MS).band_percent / beside
     for method in ("wflc_flc", "adaptive"):
         left = _one(lines, method, 0)
         rows.append(
@@ -77,9 +81,10 @@ def _emulated() -> list[Row]:
             "1",
             f"horizon of the loop, {LOOP_MS} ms; {HELD}",
             0.5,
-            _one(lines, "adaptive", LOOP_MS).band_percent / _one(lines, "wflc_flc", LOOP_MS).band_percent,
+            _one(lines, "adaptive", LOOP_MS).band_percent / beside,
             "lower",
             "emulated",
+            why=f"the method learns as it cancels; a causal linear filter fitted to these very records has {least:.3f}",
         ),
     ]
     rows += _limits(lines, cases, "emulated", HELD)
@@ -97,6 +102,13 @@ def _limits(lines: Sequence[Summary], cases: Sequence[Case], kind: Kind, conditi
         found = [score(case, p, ticks, design).all_percent for case, p in zip(cases, predictions, strict=True)]
         return float(np.mean(found))
 
+    unseen = best.lifted_percent / _one(lines, UNSEEN, LOOP_MS).lifted_percent
+    why = {
+        (LIFTED, ORACLE): "the limit is fitted to the samples that it is scored on, unseen by the method; over "
+        f"a limit that has not seen the second that it is scored on it is {unseen:.3f}",
+        (PLAIN, OTHERS): NOT_ASKED,
+        (PLAIN, ORACLE): NOT_ASKED,
+    }
     rows: list[Row] = []
     for name, limit, unlifted in (
         ("trained on other hands", OTHERS, plain([b.others[ticks] for b in bounds])),
@@ -104,7 +116,7 @@ def _limits(lines: Sequence[Summary], cases: Sequence[Case], kind: Kind, conditi
     ):
         for measure, ours, reference in (
             (LIFTED, best.lifted_percent, _one(lines, limit, LOOP_MS).lifted_percent),
-            ("plain 2-20 Hz, limit fitted so", best.all_percent, unlifted),
+            (PLAIN, best.all_percent, unlifted),
         ):
             rows.append(
                 Row(
@@ -116,7 +128,7 @@ def _limits(lines: Sequence[Summary], cases: Sequence[Case], kind: Kind, conditi
                     ours / reference,
                     "lower",
                     kind,
-                    why="" if measure == LIFTED else "the method is asked to make 8 to 12 Hz small, not 2 to 20",
+                    why=why.get((measure, limit), ""),
                 )
             )
     return rows
