@@ -1,9 +1,9 @@
-"""The output guard's arithmetic, as functions that run in the interpreter and, over the same memory, compiled.
+"""Computes limits, slew and ramp of the output guard, in the interpreter and compiled, over the same memory.
 
-They read no clock and raise nothing. The interpreter runs them over ``array``, whose items are plain Python numbers:
-a numpy item costs more than the arithmetic. Compiled code sees that memory through ``GuardState.view``. This module
-imports no numba, because the guardian's process and short commands drive outputs without it; a compiled loop gives the
-functions to ``hal.compiled.kernel``.
+The functions read no clock and raise nothing. The interpreter runs them over ``array``, whose items are plain Python
+numbers, because a numpy item costs more than the arithmetic. Compiled code uses that memory through
+``GuardState.view``. This module imports no numba, because the guardian's process and short commands drive outputs
+without it; a compiled loop gives the functions to ``hal.compiled.kernel``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""List the sets of three I2C addresses that the straps of one BMX055 can select.
+"""Lists the sets of three I2C addresses that the straps of one BMX055 can select.
 
 Source: BST-BMX055-DS000 rev 1.1, "I2C interface".
 """

@@ -1,4 +1,4 @@
-"""Convert the counts of the BMX055's magnetometer to tesla with the trim values and Hall resistance of the die.
+"""Converts the counts of the BMX055's magnetometer to tesla with the trim values and Hall resistance of the die.
 
 Source: Bosch BMM050 API, to which BST-BMX055-DS000 refers ("Magnetic field data temperature compensation").
 """

@@ -1,4 +1,4 @@
-"""Register maps of the three dies of a BMX055.
+"""Declares the registers of the three dies of a BMX055.
 
 Source: Bosch BST-BMX055-DS000 rev 1.1, "Register description accelerometer", "... gyroscope", "... magnetometer"
 (ACC, GYR and MAG in the sources below). The trim block of the magnetometer is "reserved" there; its layout is

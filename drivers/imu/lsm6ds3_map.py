@@ -1,4 +1,4 @@
-"""Register map of the LSM6DS3.
+"""Declares the registers of the LSM6DS3.
 
 Source: STMicroelectronics DocID026899, "Register description" (chapter 9; the section has the register's name).
 """

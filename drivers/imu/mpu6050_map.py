@@ -1,4 +1,4 @@
-"""Register map of the MPU-6050.
+"""Declares the registers of the MPU-6050.
 
 Source: InvenSense RM-MPU-6000A-00 rev 4.2 (section and page with each register); offset registers from the
 application note "MPU Hardware Offset Registers" rev 1.0. That note gives the accelerometer offsets in 8 g format

@@ -1,4 +1,4 @@
-"""``CanAmplifier.write`` and ``safe_step`` for a compiled loop: the driver's own functions on its own memory.
+"""Does ``CanAmplifier.write`` and ``safe_step`` in a compiled loop: the driver's own functions on its own memory.
 
 What the driver would raise is handed over: a failure of the bus is kept in ``FAILED`` for ``CanAmplifier.pending``, and
 a bad link is found again by the driver's ``write``. Importing this module imports numba.

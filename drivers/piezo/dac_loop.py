@@ -1,4 +1,4 @@
-"""The transfers of ``DacOutput`` for a compiled loop, on the driver's own memory.
+"""Makes the transfers of ``DacOutput`` in a compiled loop, on the driver's own memory.
 
 A transfer that fails, and an answer that differs from the command, is kept for ``DacOutput.pending``: the driver's
 next ``write`` or ``verify`` raises or reports it. Importing this module imports numba.

@@ -1,4 +1,4 @@
-"""The E-727's commands as a compiled kernel on bytes: the driver and a compiled loop call the same one.
+"""Encodes the E-727's commands in a compiled kernel, which the driver and a compiled loop call.
 
 Importing this module imports numba; the driver does so when it asks the controller who it is, before a ramp can be due.
 """

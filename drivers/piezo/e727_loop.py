@@ -1,4 +1,4 @@
-"""The E-727's ``write`` and ``safe_step`` for a compiled loop: the driver's own functions on its own memory, on a
+"""Does the E-727's ``write`` and ``safe_step`` in a compiled loop: the driver's own functions on its own memory, on a
 descriptor.
 
 What the driver would raise, and what is not ordinary, is handed over: the memory is left so that ``E727.write`` goes on

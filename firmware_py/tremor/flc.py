@@ -1,4 +1,4 @@
-"""Fourier linear combiner at a frequency and phase given from outside (Ang 2004 (5.11), (5.12)), with a bias weight."""
+"""Fits a Fourier linear combiner with a bias weight at a given phase (Ang 2004 (5.11), (5.12))."""
 
 from __future__ import annotations
 

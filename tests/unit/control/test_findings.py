@@ -31,7 +31,7 @@ from hal.errors import (
 from tools.research.reports.findings_page import markdown
 
 ROOT = Path(__file__).parents[3]
-REPORTS = {"report": 1, "doubt": 1, "report_error": 3, "report_after": 4}
+REPORTS = {"report": 1, "report_reading": 1, "report_error": 3, "report_after": 4}
 """Ways of Incidents to a consequence, with the number of their own arguments."""
 INSIDE = {Finding.TOO_MANY_HOLDS, Finding.HOLD_TOO_LONG, Finding.NEUTRAL_NOT_REACHED}
 """Findings that Incidents and the supervisor make of others."""
