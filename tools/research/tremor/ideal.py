@@ -9,6 +9,10 @@ loop leaves beyond it, the instrument's sensing, steps and strokes have cost; wh
 
 The bound: the best fixed causal linear filter, fitted to this record, on the tip's own acceleration through the sensor
 filter (and noise), at the loop's delay. It knows no instrument: what it leaves is what any instrument must leave.
+
+The loop with noise and seed 2 leaves 1.302 times the bound over 15 s, in squares 1.69: 1.00 are the bound, which is
+fitted to the seconds that it is scored on, 0.37 what the estimator's defaults leave beyond it, 0.17 the preset of the
+bench in their place (0.13 of it its priors and what axes take from each other), and 0.15 the instrument.
 """
 
 from __future__ import annotations
