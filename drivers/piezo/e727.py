@@ -164,10 +164,10 @@ class E727(GuardedOutput):
             if self._neutral == SENT:
                 self._neutral = ASKED if self.link.ask(f"{self._verb}?") else SENT
                 return False
-            told = self.link.take_values(f"{self._verb}?", CHANNELS)
-            if told is None:
+            answer = self.link.take_values(f"{self._verb}?", CHANNELS)
+            if answer is None:
                 return False
-            if fault := self._fault_of_neutral(told):
+            if fault := self._fault_of_neutral(answer):
                 raise ProtocolError(fault, device=self.name)
         except HalError:
             self._neutral = UNSENT
@@ -176,11 +176,11 @@ class E727(GuardedOutput):
         self._neutral = UNSENT
         return True
 
-    def _fault_of_neutral(self, told: Sequence[float]) -> str:
-        """Return why ``told`` (3,), in the controller's unit, is not neutral; empty if it is."""
-        told_V, neutral = [v / self.per_V for v in told], [limit.safe_V for limit in self.limits]
-        good = all(abs(a - b) < 0.01 for a, b in zip(told_V, neutral, strict=True))
-        return "" if good else f"neutral is {neutral} V, the controller answers {told_V}"
+    def _fault_of_neutral(self, answer: Sequence[float]) -> str:
+        """Return why ``answer`` (3,), in the controller's unit, is not neutral; empty if it is."""
+        values_V, neutral = [v / self.per_V for v in answer], [limit.safe_V for limit in self.limits]
+        good = all(abs(a - b) < 0.01 for a, b in zip(values_V, neutral, strict=True))
+        return "" if good else f"neutral is {neutral} V, the controller answers {values_V}"
 
     def _ramp_step(self) -> bool:
         """Make one step of the ramp. Return True when the port has taken the last one."""
