@@ -208,8 +208,12 @@ class GuardedOutput:
     def ramp_to_neutral(self) -> None:
         """Make the steps of the ramp, one per millisecond, until the outputs are at neutral."""
         with self.bringing_to_neutral():
-            while not self.guard.at_safe_state() and not self.safe_step():
+            while self._is_away() and not self.safe_step():
                 wait_s(self._clock, RAMP_STEP_S)
+
+    def _is_away(self) -> bool:
+        """Return True while the outputs are not at neutral."""
+        return not self.guard.at_safe_state()
 
     @contextmanager
     def bringing_to_neutral(self, failed: str = "were NOT brought to neutral") -> Generator[None]:

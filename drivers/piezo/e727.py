@@ -22,17 +22,22 @@ from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.arrays import Array
 from hal.contracts import Clock, SerialPort
-from hal.errors import BenchError, WrongDevice
+from hal.errors import BenchError, HalError, ProtocolError, WrongDevice
 from hal.types import ChannelInfo, OutputLimit
 from hal.wire_bits import serial_bits
 
 CHANNELS = 3
 RATE_MAX_HZ = 200.0
+RAMP_STEPS = 11
+"""Number of ramp steps (1 ms each). It leaves 9 of the 20 ms until neutral for the question where the outputs are."""
 EPSILON_V = 1e-4  # four decimals are sent
 COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
 """Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
 ERROR_BYTES = len("ERR?\n")
 """Bytes that ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
+
+UNSENT, SENT, ASKED = range(3)
+"""How far the last step of a ramp is: not sent; taken by the port; followed by the question what was told."""
 
 
 class E727(GuardedOutput):
@@ -62,7 +67,7 @@ class E727(GuardedOutput):
             raise BenchError(f"neutral_V = {neutral_V} is outside {lo_V} .. {hi_V} V", device=name)
         self.name = name
         self.limits = (OutputLimit(lo_V, hi_V, slew_V_per_s, neutral_V),) * CHANNELS
-        self.guard = OutputGuard(name, self.limits, clock, longest_gap_s=1.5 / rate_hz)
+        self.guard = OutputGuard(name, self.limits, clock, ramp_steps=RAMP_STEPS, longest_gap_s=1.5 / rate_hz)
         self.words = array("q", bytes(8 * WORDS))
         self.words[PERIOD_NS] = round(1e9 / rate_hz)
         self.port = port
@@ -72,6 +77,7 @@ class E727(GuardedOutput):
         self._clock = clock
         self._verb = "MOV" if self.servo else "SVA"
         self._position_known = False
+        self._neutral = UNSENT
         self._kernels: Any = None
         self._text = np.zeros(0, np.uint8)
 
@@ -103,17 +109,15 @@ class E727(GuardedOutput):
         if not self._position_known:
             self.probe()
         self._load_kernels()
-        self._position_known = False
-        while not self.safe_step():
+        self._position_known, self._neutral = False, UNSENT
+        while not self._ramp_step():  # what follows asks more than ``safe_step`` does
             yield
         self.link.settle()
         yield
         self.link.command(self._command().decode().rstrip())
         yield
-        reported_V = [v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)]
-        neutral = [limit.safe_V for limit in self.limits]
-        good = all(abs(a - b) < 0.01 for a, b in zip(reported_V, neutral, strict=True))
-        self.guard.require(good, f"neutral is {neutral} V, the controller answers {reported_V}")
+        fault = self._fault_of_neutral(self.link.values(f"{self._verb}?", CHANNELS))
+        self.guard.require(not fault, fault)
         self.guard.armed = True
 
     @property
@@ -149,8 +153,39 @@ class E727(GuardedOutput):
         return mask
 
     def safe_step(self) -> bool:
-        """Make one step of the ramp. Steps between two command times are not sent, except the last one. The first call
-        may have to query the outputs, 8 ms at 115200 baud; the ramp's time begins before that."""
+        """Make one step of the ramp; after the last one ask the controller what it was told, and return True once it
+        answers neutral: a line may hold back what the port has taken. That takes 7 ms at 115200 baud. Steps between two
+        command times are not sent, except the last one. The first tick may have to ask where the outputs are, 8 ms: the
+        ramp began before that.
+
+        Another answer, and one that does not come, raise; the next call sends neutral anew."""
+        if self._neutral == UNSENT:
+            self._neutral = SENT if self._ramp_step() else UNSENT
+            return False
+        try:
+            if self._neutral == SENT:
+                self._neutral = ASKED if self.link.ask(f"{self._verb}?") else SENT
+                return False
+            answer = self.link.take_values(f"{self._verb}?", CHANNELS)
+            if answer is None:
+                return False
+            if fault := self._fault_of_neutral(answer):
+                raise ProtocolError(fault, device=self.name)
+        except HalError:
+            self._neutral = UNSENT
+            self.link.forget_answer()
+            raise
+        self._neutral = UNSENT
+        return True
+
+    def _fault_of_neutral(self, answer: Sequence[float]) -> str:
+        """Return why ``answer`` (3,), in the controller's unit, is not neutral; empty if it is."""
+        values_V, neutral = [v / self.per_V for v in answer], [limit.safe_V for limit in self.limits]
+        good = all(abs(a - b) < 0.01 for a, b in zip(values_V, neutral, strict=True))
+        return "" if good else f"neutral is {neutral} V, the controller answers {values_V}"
+
+    def _ramp_step(self) -> bool:
+        """Make one step of the ramp. Return True when the port has taken the last one."""
         if not self._position_known:
             asked_ns = self._clock.now_ns()
             self.link.settle()  # else an answer to ``ERR?`` that is under way is taken for this one
@@ -174,11 +209,14 @@ class E727(GuardedOutput):
     def close(self) -> None:
         """Ramp to neutral unless there, then close the port."""
         try:
-            if self._position_known:
-                self.ramp_to_neutral()
+            self.ramp_to_neutral()
         finally:
             self._position_known = False
             self.link.close()
+
+    def _is_away(self) -> bool:
+        """Return True while the outputs are not at neutral, as far as the controller has said."""
+        return self._position_known and (self._neutral != UNSENT or not self.guard.at_safe_state())
 
     def channels(self) -> Sequence[ChannelInfo]:
         limit = self.limits[0]

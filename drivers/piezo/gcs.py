@@ -6,6 +6,7 @@ ends with SP LF, the last with LF.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from array import array
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hal.contracts import Clock, SerialPort
-from hal.errors import HalTimeout, ProtocolError
+from hal.errors import HalError, HalTimeout, ProtocolError
 
 ERRORS = {
     1: "parameter syntax error",
@@ -98,6 +99,14 @@ def keep_unsent(memory: LinkMemory, data: Any, begin: int, end: int) -> None:
     memory.sizes[UNSENT] = end - begin
 
 
+def _is_whole(reply: bytes) -> bool:
+    return reply.endswith(b"\n") and not reply.endswith(b" \n")
+
+
+def _lines_of(reply: bytes) -> list[str]:
+    return [line.strip() for line in reply.decode("latin-1").splitlines()]
+
+
 class GcsLink:
     """Talks to one controller on one port. ``memory`` holds unsent bytes and the incomplete answer."""
 
@@ -118,7 +127,7 @@ class GcsLink:
         self._port.write(text.encode() + b"\n", self.timeout_s)
         limit_ns = self._clock.now_ns() + round(self.timeout_s * 1e9)
         reply = b""
-        while not reply.endswith(b"\n") or reply.endswith(b" \n"):
+        while not _is_whole(reply):
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9
             n = self._port.read_into(self._buf, left_s) if left_s > 0 else 0
             if n == 0 or len(reply) > LONGEST_REPLY:
@@ -128,12 +137,14 @@ class GcsLink:
                     partial=len(reply),
                 )
             reply += bytes(self._buf[:n])
-        return [line.strip() for line in reply.decode("latin-1").splitlines()]
+        return _lines_of(reply)
 
     def values(self, text: str, n: int) -> list[float]:
         """Return the first ``n`` values of an answer with ``1=value`` per line. Raises ``ProtocolError`` for anything
         else, fewer values included."""
-        lines = self.query(text)
+        return self._values_in(self.query(text), text, n)
+
+    def _values_in(self, lines: list[str], text: str, n: int) -> list[float]:
         try:
             values = [float(line.split("=", 1)[1]) for line in lines]
             if not all(math.isfinite(value) for value in values):
@@ -183,8 +194,43 @@ class GcsLink:
                 self._read_complaint()
             if verdict != NOTHING:
                 return
+        self._require_answer_in_time("ERR?")
+
+    def ask(self, text: str) -> bool:
+        """Send the query ``text`` for ``take_values``. False while an answer is under way or bytes are stuck. Raises
+        what ``take_error`` and ``send`` do."""
+        self.take_error()
+        if self._awaits or not self.send(text.encode() + b"\n"):
+            return False
+        self.memory.asked_ns[0] = self._clock.now_ns()
+        return True
+
+    def take_values(self, text: str, n: int) -> list[float] | None:
+        """Return the answer to ``ask``, see ``values``; ``None`` while it is under way. Raises ``HalTimeout`` where it
+        is late."""
+        memory = self.memory
+        self._is_free()
+        got = self._port.read_into(self._buf, 0.0)
+        end = memory.sizes[LINE] + got
+        if end > len(memory.line):
+            raise ProtocolError(f"the answer to {text!r} does not end", device=self.name)
+        memory.line[memory.sizes[LINE] : end] = self._buf[:got]
+        memory.sizes[LINE] = end
+        if not _is_whole(reply := bytes(memory.line[:end])):
+            self._require_answer_in_time(text)
+            return None
+        memory.asked_ns[0], memory.sizes[LINE] = NEVER, 0
+        return self._values_in(_lines_of(reply), text, n)
+
+    def forget_answer(self) -> None:
+        """Expect no answer any more, and discard what has come of it."""
+        self.memory.asked_ns[0], self.memory.sizes[LINE] = NEVER, 0
+        with contextlib.suppress(HalError):  # the next call says it
+            self._port.drain_input()
+
+    def _require_answer_in_time(self, text: str) -> None:
         if self._clock.now_ns() - self.memory.asked_ns[0] > self.timeout_s * 1e9:
-            raise HalTimeout(f"no answer to 'ERR?' within {self.timeout_s} s: link lost?", device=self.name)
+            raise HalTimeout(f"no answer to {text!r} within {self.timeout_s} s: link lost?", device=self.name)
 
     def _read_complaint(self) -> None:
         memory = self.memory

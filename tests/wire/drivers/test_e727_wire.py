@@ -8,8 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from drivers.output_guard import RAMP_STEPS
-from drivers.piezo.e727 import E727
+from drivers.piezo.e727 import E727, RAMP_STEPS
 from hal.clock import VirtualClock
 from hal.errors import BenchError, Disconnected, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
 from tests.wire.drivers.scripted_ports import ScriptedSerial
@@ -34,6 +33,8 @@ AT_NEUTRAL: Script = [
     ("r", b"1=5.000000000e+01 \n2=5.000000000e+01 \n3=5.000000000e+01\n"),
 ]
 NEUTRAL = b"SVA 1 50.0000 2 50.0000 3 50.0000\n"
+QUESTION_STEPS = 2
+"""The question where the outputs are, and its answer: a script answers at once."""
 ARM: Script = [*PROBE, *AT_NEUTRAL, ("w", NEUTRAL), ("w", NEUTRAL), ("w", b"ERR?\n"), ("r", b"0\n"), *AT_NEUTRAL]
 
 
@@ -62,10 +63,10 @@ def test_probe_reads_identity_axes_and_sets_the_servo():
 
 def test_from_the_probe_on_nothing_is_loaded_or_compiled_for_a_ramp_to_neutral(monkeypatch: pytest.MonkeyPatch):
     """A run that fails before it arms ramps outputs that another program left; that may not wait for a compiler."""
-    device, port, _ = make(*PROBE, *AT_NEUTRAL, ("w", NEUTRAL))
+    device, port, _ = make(*PROBE, *AT_NEUTRAL, ("w", NEUTRAL), *AT_NEUTRAL)
     device.probe()
     monkeypatch.setitem(sys.modules, "drivers.piezo.e727_kernels", None)  # an import fails
-    assert device.safe_step()
+    assert [device.safe_step() for _ in range(3)] == [False, False, True]
     port.done()
 
 
@@ -80,13 +81,11 @@ def test_an_answer_under_way_is_not_taken_for_another_one():
 def test_the_time_of_the_question_where_the_outputs_are_is_the_ramps():
     """A run that was stopped before it armed was at neutral 22 ms later, with a promise of 21 ms."""
     asked: Script = [("w", b"SVA?\n"), ("at", 8 * MS), ("r", b"1=0.0 \n2=0.0 \n3=0.0\n")]
-    at_once_V = 6 * 50 / RAMP_STEPS  # at the slew limit: 20 V in the millisecond of one step
-    at_10_ms_V = 11 * 50 / RAMP_STEPS
-    ramp = [sva(V, V, V) for V in (at_once_V, at_10_ms_V, 50.0)]
-    device, port, clock = make(*asked, *ramp)
+    at_once_V = 4 * 50 / RAMP_STEPS  # at the slew limit: 20 V in the millisecond of one step
+    device, port, clock = make(*asked, *(sva(V, V, V) for V in (at_once_V, 50.0)), *AT_NEUTRAL)
     while not device.safe_step():
         clock.burn_ns(MS)
-    assert clock.now_ns() <= RAMP_STEPS * MS
+    assert clock.now_ns() <= (RAMP_STEPS + QUESTION_STEPS) * MS
     port.done()
 
 
@@ -232,21 +231,69 @@ def test_partial_writes_are_finished_before_anything_else():
 
 
 def test_safe_ramp_ends_exactly_at_neutral():
-    steps = [sva(*(v + (50 - v) * k / RAMP_STEPS for v in (60, 40, 50))) for k in (1, 6, 11, 16)]
-    device, port, clock = armed(sva(60, 40, 50), *steps, rate_hz=200.0, slew_V_per_s=1e9)
+    steps = [sva(*(v + (50 - v) * k / RAMP_STEPS for v in (60, 40, 50))) for k in (1, 6, RAMP_STEPS)]
+    device, port, clock = armed(sva(60, 40, 50), *steps, *AT_NEUTRAL, rate_hz=200.0, slew_V_per_s=1e9)
     device.write(np.array([60.0, 40.0, 50.0]))
     clock.burn_ns(5 * MS)
     done = []
-    for _ in range(RAMP_STEPS):
+    for _ in range(RAMP_STEPS + QUESTION_STEPS):
         done.append(device.safe_step())
         clock.burn_ns(MS)
-    assert done == [False] * (RAMP_STEPS - 1) + [True]
+    assert done == [False] * (RAMP_STEPS + QUESTION_STEPS - 1) + [True]
+    port.done()
+
+
+def away(*script: tuple[object, ...]) -> tuple[E727, ScriptedSerial, VirtualClock]:
+    """Return a controller one volt away from neutral, whose ramp is over; ``script`` follows its last step."""
+    steps = [sva(51 - k / RAMP_STEPS, 50, 50) for k in (1, RAMP_STEPS)]
+    device, port, clock = armed(sva(51, 50, 50), *steps, *script)
+    device.write(np.array([51.0, 50.0, 50.0]))
+    clock.burn_ns(10 * MS)
+    for _ in range(RAMP_STEPS):
+        assert not device.safe_step()
+        clock.burn_ns(MS)
+    return device, port, clock
+
+
+def test_neutral_is_reached_when_the_controller_says_so_and_not_when_the_port_has_taken_it():
+    """A line may hold back what its port has taken: 18 V from neutral, a run said that neutral was confirmed."""
+    whole = AT_NEUTRAL[1][1]
+    assert isinstance(whole, bytes)
+    device, port, _ = away(AT_NEUTRAL[0], ("wait",), ("r", whole[:30]), ("r", whole[30:]))
+    assert [device.safe_step() for _ in range(4)] == [False, False, False, True]
+    port.done()
+
+
+def test_another_answer_than_neutral_is_an_error_and_neutral_is_sent_anew():
+    device, port, _ = away(AT_NEUTRAL[0], ("r", b"1=5.1e+01 \n2=5.0e+01 \n3=5.0e+01\n"), ("w", NEUTRAL), *AT_NEUTRAL)
+    assert not device.safe_step()
+    with pytest.raises(ProtocolError, match=r"neutral is .* the controller answers \[51.0, 50.0, 50.0\]"):
+        device.safe_step()
+    assert [device.safe_step() for _ in range(3)] == [False, False, True]
+    port.done()
+
+
+def test_an_answer_that_does_not_come_is_asked_for_again():
+    """The first answer is lost. It once kept every later step from being made."""
+    device, port, clock = away(AT_NEUTRAL[0], ("wait",), ("w", NEUTRAL), *AT_NEUTRAL)
+    assert not device.safe_step()
+    clock.burn_ns(501 * MS)
+    with pytest.raises(HalTimeout, match="no answer to 'SVA"):
+        device.safe_step()
+    assert [device.safe_step() for _ in range(3)] == [False, False, True]
+    port.done()
+
+
+def test_closing_waits_for_the_answer_as_well():
+    device, port, _ = away(AT_NEUTRAL[0], ("wait",), AT_NEUTRAL[1])
+    assert not device.safe_step()
+    device.close()
     port.done()
 
 
 def test_close_brings_the_outputs_to_neutral_first():
-    steps = [sva(60 + (50 - 60) * k / RAMP_STEPS, 50, 50) for k in (1, 6, 11, 16)]
-    device, port, clock = armed(sva(60, 50, 50), *steps, rate_hz=200.0, slew_V_per_s=1e9)
+    steps = [sva(60 + (50 - 60) * k / RAMP_STEPS, 50, 50) for k in (1, 6, RAMP_STEPS)]
+    device, port, clock = armed(sva(60, 50, 50), *steps, *AT_NEUTRAL, rate_hz=200.0, slew_V_per_s=1e9)
     device.write(np.array([60.0, 50.0, 50.0]))
     clock.burn_ns(5 * MS)
     device.close()
