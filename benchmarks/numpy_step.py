@@ -227,7 +227,7 @@ class NumpyStep:
         e.predicted[:, e.at] = ahead
         e.power += p.smoothing * (now**2 - e.power)
         e.miss += p.smoothing * (missed**2 - e.miss)
-        frequency = e.combiner["wflc"]["omega"] * p.combiner.seen.tick_hz / (2.0 * np.pi)
+        frequency = e.combiner["wflc"]["omega"] * p.combiner.sensor.tick_hz / (2.0 * np.pi)
         settled = e.ticks > p.settle_ticks
         trust = np.maximum(0.0, 1.0 - np.sqrt((e.miss + p.floor2) / (e.power + p.floor2))) if settled else np.zeros(3)
         out = np.stack([now, ahead, frequency, np.sqrt(2.0 * e.power), trust, core])

@@ -132,8 +132,8 @@ def check_parts(draw: Draw, bench: OpenBench, micron: Micron) -> None:
     assert sense["attitude"]["dt_s"] == pytest.approx(tick_s)
     assert sense["calibration"]["supply_smoothing"] == pytest.approx(1.0 - np.exp(-tick_s / lag_s))
     assert sense["calibration"]["lsb_V"] == pytest.approx(draw.range_V / 32768)
-    assert estimate["combiner"]["seen"]["tick_hz"] == tick_hz
-    assert estimate["combiner"]["seen"]["lag_s"] == pytest.approx(lag_s)
+    assert estimate["combiner"]["sensor"]["tick_hz"] == tick_hz
+    assert estimate["combiner"]["sensor"]["lag_s"] == pytest.approx(lag_s)
     assert act["tick_hz"] == tick_hz
     wanted_slew = draw.actuation.get("slew_V_per_s", draw.slew_V_per_s)
     assert act["slew_step_V"] == pytest.approx(wanted_slew * tick_s)
