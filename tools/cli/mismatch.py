@@ -80,6 +80,8 @@ def diagnose(
     With --together several recordings of one system get one answer: one set of effects for all, scored on recordings
     that the fit left out, and what changes between them (docs/many-recordings.md).
 
+    'micron mismatch physics' lists all effects that can be named.
+
     Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
     """
     with clear_errors():
@@ -398,7 +400,6 @@ def simulate(
         from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import columns_left_out, load
-        from tools.mismatch.report.wording import percent
         from tools.mismatch.simulate_bounds import run_bounded
 
         loaded = load(recording or twin)
@@ -420,8 +421,7 @@ def simulate(
             write_text_atomic(out, columns(loaded, simulated))
         say = console() if json_file == "-" else data_console()
         for row in rows:
-            share = "" if row.share is None else f", {percent(row.share)} of the recording's standard deviation"
-            say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}{share}", highlight=False)
+            say.print(row.text(), highlight=False, soft_wrap=True)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
 
 

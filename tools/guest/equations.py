@@ -25,6 +25,12 @@ _ONE = {
 _TWO = {"min": MIN, "max": MAX, "atan2": ATAN2, "arctan2": ATAN2, "minimum": MIN, "maximum": MAX, "pow": POW}
 FUNCTIONS = (*_ONE, *_TWO, "where", "clip")
 """Functions that an equation may call."""
+_OF_NUMPY = {name: getattr(np, name, None) for name in (*_ONE, *_TWO, "square")}
+NUMPY_FUNCTIONS = (
+    *(name for name, f in _OF_NUMPY.items() if isinstance(f, np.ufunc) and f.__name__ in (name, "absolute")),
+    *("where", "clip"),
+)
+"""Functions of numpy that a Python function may call on states, inputs and parameters."""
 MOST_OPERATIONS = 2000
 
 
@@ -165,12 +171,15 @@ class Traced:
         return self._with(LEQ, other, True)
 
     def __bool__(self) -> bool:
-        raise EquationError("a branch depends on a state, an input or a parameter; write it with numpy.where")
+        raise EquationError(
+            "a branch depends on a state, an input or a parameter; write it with numpy.where, and max and min as"
+            " numpy.maximum and numpy.minimum"
+        )
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: object, **options: object) -> Traced:
         known = _UFUNCS.get(ufunc.__name__)
         if method != "__call__" or options or known is None:
-            raise EquationError(f"numpy.{ufunc.__name__} is unknown here; known: {', '.join(FUNCTIONS)}")
+            raise EquationError(f"numpy.{ufunc.__name__} is unknown here; known: {', '.join(NUMPY_FUNCTIONS)}")
         code, turned = known
         args = [register_of(self.builder, x) for x in inputs]
         if turned:
@@ -181,7 +190,7 @@ class Traced:
 
     def __array_function__(self, function: Any, types: object, args: Sequence[object], options: object) -> Traced:
         if options or function.__name__ not in ("where", "clip"):
-            raise EquationError(f"numpy.{function.__name__} is unknown here; known: {', '.join(FUNCTIONS)}")
+            raise EquationError(f"numpy.{function.__name__} is unknown here; known: {', '.join(NUMPY_FUNCTIONS)}")
         registers = [register_of(self.builder, x) for x in args]
         return Traced(self.builder, called(self.builder, function.__name__, registers, "derivatives"))
 
@@ -222,7 +231,7 @@ def trace(builder: Builder, function: Callable[..., object], groups: Mapping[str
         if Traced.__name__ in str(error):  # math.sin, scipy, float(...): they need the number itself
             raise EquationError(
                 f"derivatives cannot be written as equations ({error}); in place of math and scipy use numpy's"
-                f" {', '.join(FUNCTIONS)}"
+                f" {', '.join(NUMPY_FUNCTIONS)}"
             ) from error
         raise EquationError(
             f"derivatives(t, states, inputs, parameters) cannot be written as equations ({error!r})"

@@ -30,7 +30,13 @@ TOP = (
     ),
     Key("twin", "table", "the simulation that the recording is compared with"),
     Key("channels", "list of tables", "one per column that is used"),
-    Key("segments", "list of samples", "where a new run begins: plants with states start there afresh", "one run"),
+    Key(
+        "segments",
+        "list of samples",
+        "samples where the second and later runs begin, and states start afresh: [1000] makes runs of samples 0 to 999"
+        " and 1000 to the end; 0 is not in the list",
+        "one run",
+    ),
     Key(
         "conditions",
         "table",
@@ -112,12 +118,22 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("B", "rows of numbers", "one column per input, in the order of the channels"),
             Key("C", "rows of numbers", "one row per output, in the order of the channels"),
             Key("D", "rows of numbers", "y = C x + D u + y0", "0"),
-            Key("x0", "list of numbers", "state at the first sample", "set by the first samples"),
+            Key("x0", "list of numbers", "state at the first sample, taken as given", "set by the first samples"),
             Key("first", "table of A, B, C, D", "a filter in front, one input and output; written by apply", "none"),
-            Key("y0", "list of numbers", "offset of each output", "0"),
+            Key(
+                "y0",
+                "list of numbers",
+                "offset of each output, re-fitted: the ambient temperature, if the states are differences from it",
+                "0",
+            ),
             HOLD,
             Key("discrete", "true, false", "A and B are those of the difference equation", "false"),
-            Key("states", "table by state", "name and unit of each row of A: forces are then tried inside", "none"),
+            Key(
+                "states",
+                "table by state",
+                'name = "unit" of each state, in the order of the rows of A: forces are then tried inside',
+                "none",
+            ),
         ),
         "columns": (
             Key(
@@ -137,8 +153,9 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key(
                 "states",
                 "table by state",
-                "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start (0"
-                " if left out) must be one where the equations are finite; then the first samples set the states",
+                "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start (0 if"
+                " left out) is a first guess at which the equations are finite: the first samples override it, also"
+                " where you give it, as far as the outputs show the state",
             ),
             Key(
                 "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
@@ -159,7 +176,7 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             ),
             Key(
                 "units",
-                "table by name, as in [twin.units]",
+                "table by name; may stand as [twin.units]",
                 "of each parameter; of an input or output that the equations want in another unit than its column's",
                 "none",
             ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -11,9 +12,9 @@ from hal.arrays import Array
 from hal.types import STANDARD_GRAVITY
 
 Dimension = tuple[int, ...]
-"""Exponents of metre, kilogram, second, ampere, kelvin, radian, count."""
+"""Exponents of metre, kilogram, second, ampere, kelvin, radian, count, mole."""
 
-_NONE: Dimension = (0, 0, 0, 0, 0, 0, 0)
+_NONE: Dimension = (0, 0, 0, 0, 0, 0, 0, 0)
 
 
 class UnitError(ValueError):
@@ -30,8 +31,10 @@ class Unit:
     offset: float = 0.0
 
 
-def _d(*, m: int = 0, kg: int = 0, s: int = 0, a: int = 0, k: int = 0, rad: int = 0, count: int = 0) -> Dimension:
-    return (m, kg, s, a, k, rad, count)
+def _d(
+    *, m: int = 0, kg: int = 0, s: int = 0, a: int = 0, k: int = 0, rad: int = 0, count: int = 0, mol: int = 0
+) -> Dimension:
+    return (m, kg, s, a, k, rad, count, mol)
 
 
 # symbol: (dimension, factor to SI, offset, takes SI prefixes)
@@ -52,6 +55,8 @@ _SYMBOLS = MappingProxyType(
         "h": (_d(s=1), 3600.0, 0.0, False),
         "Hz": (_d(s=-1), 1.0, 0.0, True),
         "kg": (_d(kg=1), 1.0, 0.0, False),
+        "gram": (_d(kg=1), 1e-3, 0.0, False),
+        "mol": (_d(mol=1), 1.0, 0.0, True),
         "g": (_d(m=1, s=-2), STANDARD_GRAVITY, 0.0, True),
         "g0": (_d(m=1, s=-2), STANDARD_GRAVITY, 0.0, False),
         "gal": (_d(m=1, s=-2), 1e-2, 0.0, False),
@@ -119,14 +124,31 @@ _SUPERSCRIPTS = str.maketrans("²³⁻¹", "23-1")
 def parse(text: str) -> Unit:
     """Parse a unit such as ``um/V``, ``m/s^2``, ``deg/s``, ``N m``, ``mg`` (milli-gravity), ``G`` (gauss).
 
-    Raises UnitError that names the unknown symbol.
+    ``g`` is standard gravity, but a gram where it is divided by a volume or an amount of substance (``g/l``,
+    ``mg/m^3``, ``g/mol``), because nobody records gravity per volume. Raises UnitError that names the unknown symbol.
     """
     cleaned = text.strip().translate(_SUPERSCRIPTS)
     if cleaned in ("", "-"):
         return Unit(text, _NONE, 1.0)
-    factor, dimension = 1.0, list(_NONE)
-    sides = cleaned.split("/")
-    for side, group in enumerate(sides):
+    terms = _terms(cleaned, text)
+    if len(terms) == 1 and terms[0][1] == 1 and "/" not in cleaned:
+        return Unit(text, *_symbol(terms[0][0], text))
+    parts = [(symbol, power, *_symbol(symbol, text)[:2]) for symbol, power in terms]
+    beside = _product([(power, dim) for symbol, power, dim, _ in parts if not _is_gravity(symbol)])
+    if beside[1] == beside[3] == 0 and (beside[0] <= -3 or beside[7] < 0):
+        gram = _SYMBOLS["gram"]
+        parts = [
+            (s, power, gram[0], gram[1] * f / STANDARD_GRAVITY) if _is_gravity(s) else (s, power, dim, f)
+            for s, power, dim, f in parts
+        ]
+    factor = math.prod(f**power for _, power, _, f in parts)
+    return Unit(text, _product([(power, dim) for _, power, dim, _ in parts]), factor)
+
+
+def _terms(cleaned: str, text: str) -> list[tuple[str, int]]:
+    """Return the symbols of a unit with their powers. Raises UnitError with the whole ``text``."""
+    found: list[tuple[str, int]] = []
+    for side, group in enumerate(cleaned.split("/")):
         terms = [w for w in re.split(r"[\s*·]+", group.strip().strip("()")) if w]
         if not terms:
             raise UnitError(f"unit '{text}' has an empty part; write it like m/s^2 or N m")
@@ -134,14 +156,22 @@ def parse(text: str) -> Unit:
             match = _TERM.match(term)
             if match is None:
                 raise UnitError(f"unknown unit '{text}' (cannot read '{term}')")
-            dim, f, offset = _symbol(match["symbol"], text)
             power = int(match["power"] or 1)
-            if len(sides) == 1 and len(terms) == 1 and power == 1:
-                return Unit(text, dim, f, offset)
-            sign = power if side == 0 else -power
-            factor *= f**sign
-            dimension = [a + sign * b for a, b in zip(dimension, dim, strict=True)]
-    return Unit(text, tuple(dimension), factor)
+            found.append((match["symbol"], power if side == 0 else -power))
+    return found
+
+
+def _product(terms: Iterable[tuple[int, Dimension]]) -> Dimension:
+    """Return the dimension of a product of (power, dimension)."""
+    found = list(_NONE)
+    for power, dim in terms:
+        found = [a + power * b for a, b in zip(found, dim, strict=True)]
+    return tuple(found)
+
+
+def _is_gravity(symbol: str) -> bool:
+    """Return True for ``g`` and its multiples, which may be grams; ``kg`` and ``g0`` are one thing always."""
+    return symbol == "g" or (symbol not in _SYMBOLS and symbol[:1] in _PREFIXES and symbol[1:] == "g")
 
 
 def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:

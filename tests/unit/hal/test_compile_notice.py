@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import threading
+import time
 
 import numba
 import pytest
@@ -28,6 +30,33 @@ def test_it_speaks_after_its_patience_and_then_now_and_again(capsys: pytest.Capt
     now_s[0] += REPEAT_S
     notice.on_end(None)
     assert capsys.readouterr().err.endswith(": 4 done, 12 s\n")
+
+
+def test_one_long_kernel_is_told_while_it_compiles(capsys: pytest.CaptureFixture[str]) -> None:
+    """A kernel of minutes raises no event between its start and its end."""
+    now_s = [0.0]
+    looked = threading.Event()
+
+    def clock() -> float:
+        if threading.current_thread() is not threading.main_thread():
+            looked.set()
+        return now_s[0]
+
+    notice = CompileNotice(clock, every_s=0.01)
+    notice.on_start(None)
+    now_s[0] = 1.5 * PATIENCE_S
+    said = ""
+    for _ in range(500):
+        looked.clear()
+        assert looked.wait(10.0), "nobody looks at the clock"
+        said += capsys.readouterr().err
+        if said.endswith("\n"):
+            break
+    assert re.fullmatch(r"compiling kernels, .*: 0 done, 3 s\n", said)
+    notice.on_end(None)
+    time.sleep(0.05)
+    looked.clear()
+    assert not looked.wait(0.1), "the timer ends with the kernel"
 
 
 def test_numba_tells_it() -> None:

@@ -143,3 +143,15 @@ def test_equations_in_the_units_of_the_columns_stay_as_they_are(tmp_path: Path) 
 def test_a_channel_of_another_dimension_than_its_state_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"'x' is recorded in rad, and \[twin.states\] states m"):
         load(equations(tmp_path, "m", unit="rad"))
+
+
+def test_a_concentration_is_converted_to_the_unit_of_its_state(tmp_path: Path) -> None:
+    """Grams per litre were taken for gravity per litre, and refused."""
+    found = load(equations(tmp_path, "kg/m^3", unit="g/l"))
+    assert found.unit["x"] == "kg/m^3"
+    assert np.ptp(found.outputs["x"]) == pytest.approx(1e3 * 2.0 / 50.0, rel=1e-3)
+
+
+def test_a_share_stays_as_it_is_recorded() -> None:
+    assert si_unit("%") == "%"
+    assert si_unit("degC") == "degC"

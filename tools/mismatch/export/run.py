@@ -14,8 +14,10 @@ from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
+from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load, load_twin
+from tools.mismatch.report.wording import percent
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.fmu import FmuRun, with_equations
@@ -24,25 +26,36 @@ from tools.mismatch.twins.make import make
 from tools.numbers import rms
 
 KINDS = (".toml", ".py", ".fmu")
+LEAST_OFFSET = 0.9
+"""Ratio of the scatter to the rms of a residual below which its mean is printed as well."""
 
 
 @dataclass(frozen=True)
 class Residual:
     """Holds the rms of recorded minus simulated of an output, in the unit of the file.
 
-    ``where`` names the samples; ``share`` is the rms over that of the recorded output less its mean (None if it is
-    constant).
+    ``scatter`` is the rms about the mean ``mean``. ``where`` names the samples; ``share`` is the rms over that of the
+    recorded output less its mean (None if it is constant).
     """
 
     output: str
     unit: str
     rms: float
+    scatter: float
+    mean: float
     where: str
     share: float | None
 
     def as_dict(self) -> dict[str, object]:
         """Return the row of the command's JSON."""
         return asdict(self)
+
+    def text(self) -> str:
+        """Return the row as a sentence; the scatter is in it where a constant offset is a notable part of the rms."""
+        said = f"{self.output}: residual {self.rms:.4g} {self.unit} rms{self.where}"
+        if self.scatter < LEAST_OFFSET * self.rms:
+            said += f" ({self.scatter:.4g} {self.unit} about its mean of {self.mean:.4g} {self.unit})"
+        return said if self.share is None else f"{said}, {percent(self.share)} of the recording's standard deviation"
 
 
 def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
@@ -55,16 +68,19 @@ def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual
     for o, y in found.items():
         recorded = units.convert(recording.outputs[o], recording.unit[o], recording.file_unit[o])
         for where, (a, b) in parts.items():
-            left, moved = rms((recorded - y)[a:b]), float(np.std(recorded[a:b]))
-            rows.append(Residual(o, recording.file_unit[o], left, where, left / moved if moved > 0.0 else None))
+            e, moved = (recorded - y)[a:b], float(np.std(recorded[a:b]))
+            share = rms(e) / moved if moved > 0.0 else None
+            rows.append(Residual(o, recording.file_unit[o], rms(e), float(np.std(e)), float(np.mean(e)), where, share))
     return rows
 
 
 def as_read(recording: Recording) -> list[str]:
-    """Return what was read of a recording, as lines: twin, clock, signals, holds of inputs, notes."""
+    """Return what was read of a recording, as lines: twin, clock, signals, holds where its kind has one, notes."""
     holds = declared_holds(recording)
+    has_hold = "hold" in names(PARAMETERS.get(recording.twin.kind, ()))
     named = lambda of: ", ".join(f"{s} ({recording.file_unit[s]})" for s in of)  # noqa: E731
-    held = ", ".join(f"{s} ({recording.file_unit[s]}, hold {holds.get(s, 'not given')})" for s in recording.inputs)
+    hold = {s: f", hold {holds.get(s, 'not given')}" if has_hold or s in holds else "" for s in recording.inputs}
+    held = ", ".join(f"{s} ({recording.file_unit[s]}{hold[s]})" for s in recording.inputs)
     runs = f" in {len(recording.segments) + 1} runs" if recording.segments else ""
     lines = [
         f"twin: {recording.twin.kind}",

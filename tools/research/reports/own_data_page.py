@@ -10,15 +10,25 @@ import os
 import re
 import tempfile
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import get_args
 
+from sim_devices.physics.catalogue import EFFECTS
+from tools.guest.equations import FUNCTIONS, NUMPY_FUNCTIONS, Builder, EquationError
 from tools.mismatch import key_tables as keys
 from tools.mismatch import units
+from tools.mismatch.engine.reduce import LONG
+from tools.mismatch.engine.report import Verdict
+from tools.mismatch.engine.unexplained import about
+from tools.mismatch.infer.sealed import LEAST, SHARE
 from tools.mismatch.keys import Key
 from tools.mismatch.new import new_recording
 from tools.mismatch.recording_columns import SUFFIXES
+from tools.mismatch.recording_load import MIN_SAMPLES
+from tools.mismatch.recording_units import SI
 from tools.mismatch.text_table import SUFFIXES as TEXT
+from tools.mismatch.twins.program import parse
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 
 _GUIDE = """# Your own data
@@ -75,8 +85,10 @@ without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no c
 
 Where time steps are uneven or values are missing, the command names the line and writes nothing. Repeat it with
 `--cut`: it resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
-`recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the sample at which each
-begins, and one diagnosis covers all runs.
+`recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the samples at which they
+begin, and one diagnosis covers all.
+
+{samples}
 
 {units}
 
@@ -96,9 +108,9 @@ residual tells its spectrum. A wrong one is the usual cause of a wrong verdict: 
 Where inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give each its own:
 `hold = { command = "zero", temperature = "linear" }`.
 
-Your own equations are text, or a Python function ([a twin of your own](adding/twin.md)). An output that has the name of
-a state is converted to the state's unit. The engine tries missing forces at every state, play between two bodies that a
-spring joins, and parameters that differ with the direction of motion:
+Your own equations are text, or a Python function. An output that has the name of a state is converted to the state's
+unit. The engine tries missing forces at every state, play between two bodies that a spring joins, and parameters that
+differ with the direction of motion:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
@@ -119,21 +131,52 @@ hold = "zero"
 ```
 
 The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stand there or, as here, in `[twin]`:
-`[twin.states]` and `[twin.parameters.states]` are the same; so are the `states` of a `state_space`.
+`[twin.units]` and `[twin.parameters.units]` are the same; so are the `states` of a `state_space`.
 
-Matrices of a `state_space` are read in SI (degC stays degC). Its poles, the numerators from each input to each output
-and `y0` are re-fitted, because the data do not tell one choice of states from another. Equations of an `ode` are read
+{equations}
+
+``` { .python title='fan.py: function = "fan.py:derivatives" in [twin.parameters], in place of [twin.equations]' }
+import numpy as np
+
+def derivatives(t, states, inputs, parameters):
+    drag = parameters["bearing"] * np.maximum(states["speed"], 0.0)
+    return {"speed": (parameters["torque_per_A"] * inputs["current"] - drag) / parameters["inertia"]}
+```
+
+The function is called once, with symbols, and becomes equations. `math.sin`, Python's `max` and an `if` need numbers
+and fail. The file runs after `micron trust .` ([a twin of your own](adding/twin.md)).
+
+{si}
+Units of other dimensions stay as recorded, and so do degC and % (12 % is 12). Its poles, the numerators from each input
+to each output and `y0` are re-fitted, because the data do not tell one choice of states from another.
+Equations of an `ode` are read
 in the units of the columns unless `units` says otherwise: after `units = { current = "A", bearing = "N m s" }` the fan
 above may record its current in mA, and the report has a unit for `bearing`. If only the other reading fits, it is
 taken, with a note. The equation of an encoder's output holds its counts:
 `outputs = { angle = "shaft * 4096 / (2 * pi)" }`. Its `noise_rms`, if given, includes the rounding (0.29 counts). A
-`mechanical_axis` with the input `torque` turns; with `force` it slides. `new --twin columns` takes `sim_x_mm` or
-`x_mm_simulated` for the simulated `x_mm`. Only scale and offset of such columns are re-fitted: a wrong time constant
+`mechanical_axis` with the input `torque` turns; with `force` it slides.
+
+A `columns` twin is a column of simulated output. It is an input, and `simulated_` stands before the output's name;
+`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`. Only scale and offset are re-fitted: a wrong time constant
 appears as an effect.
 
+``` { .toml title="columns" }
+[[channels]]
+column = "x_mm"
+role = "output"
+signal = "position"
+unit = "mm"
+
+[[channels]]
+column = "x_mm_simulated"
+role = "input"
+signal = "simulated_position"
+unit = "mm"
+```
+
 `micron mismatch simulate .` runs the twin that the recording describes and prints what was read (samples, rate, units,
-holds, notes) and the residual, also as a share of the output. A wrong unit or sign shows here, before the diagnosis.
-The first command of a version compiles for up to a minute. `micron mismatch physics` lists what can be named.
+holds, notes) and the residual. A wrong unit or sign shows here, before the diagnosis. The first command of a version
+compiles for a minute or more. `micron mismatch physics` lists what can be named.
 
 Name the commanded value as input where there is one. A measured input has noise. An effect that smooths this noise (a
 lag, a resonance) then predicts better, although the machine has no such effect. State the input's `noise_rms`, and the
@@ -141,8 +184,11 @@ engine uses the input's expected course and counts the rest of its noise as nois
 
 ## 2. Diagnose, correct, run again
 
-`micron mismatch diagnose` reports where recording and twin differ and which physics is missing
-([how to read it](mismatch.md#reading-a-report)). `apply` writes the corrected twin in the format of the file's ending:
+`micron mismatch diagnose` reports where recording and twin differ and which physics is missing. Its verdict is
+{verdicts}
+([how to read it](mismatch.md#reading-a-report)). `--held-out 0.3` hides that share of each of a few stretches from the
+fit, so a slow drift lies in fitted and hidden samples alike. `apply` writes the corrected twin in the format of the
+file's ending:
 
 {formats}
 
@@ -184,7 +230,10 @@ def page() -> str:
     endings = ", ".join(f"`{s}`" for s in SUFFIXES if s not in TEXT)
     guide = _GUIDE.replace("{formats}", formats).replace("{endings}", endings).replace("{written}", written())
     known = f"Units are products and powers of these symbols, with SI prefixes: {units.listed()}; 1 is no unit."
-    guide = guide.replace("{units}", "\n".join(textwrap.wrap(known, 120)))
+    guide = guide.replace("{units}", _wrapped(f"{known} {_GRAM}")).replace("{samples}", _wrapped(_samples()))
+    si = f"Matrices of a `state_space` are read in SI: {', '.join(SI)}."
+    guide = guide.replace("{equations}", "\n".join(_equations())).replace("{si}", _wrapped(si))
+    guide = guide.replace("{verdicts}", _one_of(f"`{v}`" for v in get_args(Verdict)))
     lines = [guide, "## Every key of `recording.toml`", ""]
     for heading, table in keys.tables():
         lines += [f"### {heading}", "", *_rows(table), ""]
@@ -200,11 +249,73 @@ def page() -> str:
         "",
         "## Context signals with a fixed unit",
         "",
-        ", ".join(f"`{s}` ({' or '.join(u)})" for s, u in CONTEXT_UNITS.items())
-        + ". Any other name may be recorded beside, in any unit.",
+        "An effect that needs a signal can be found only where that is recorded, as input or context.",
+        "",
+        "| signal | unit | effects that need it |",
+        "|---|---|---|",
+        *(f"| `{s}` | {' or '.join(u)} | {_needing(s)} |" for s, u in CONTEXT_UNITS.items()),
+        "| any other name | any | none, but each parameter of an `ode` may be found to follow it |",
         "",
     ]
     return "\n".join(lines)
+
+
+_GRAM = "`g` is gravity, except in g/l, g/m^3 and g/mol; a mass is in kg or gram."
+
+
+def _samples() -> str:
+    """Return how long a recording should be, with the limits that the loader and the engine have."""
+    return (
+        f"{MIN_SAMPLES} samples are needed, and some thousands are sensible. From {round(LEAST / SHARE)} on the last"
+        f" tenth is scored once; above {LONG} the search works on reduced copies. Record the temperature as a context"
+        " channel, else no effect of it is found."
+    )
+
+
+def _equations() -> Iterator[str]:
+    """Yield the table of what equations may hold, asked of the parser itself."""
+    yield "| | in text | in a Python function |"
+    yield "|---|---|---|"
+    yield f"| functions | {_code(FUNCTIONS)} | {_code(f'np.{n}' for n in NUMPY_FUNCTIONS)} |"
+    able = [text for text in _FORMS if is_allowed(text)]
+    yield f"| operators | {_code(able)} | the same, but for `if` |"
+    refused = _code(text for text in _FORMS if text not in able)
+    yield f"| not allowed | {refused} | `math`, `scipy`, `if`, `max`, `min` |"
+    yield "| names | states, inputs, context, parameters, other equations, `t` (s), `pi` | by its four arguments |"
+
+
+_FORMS = (
+    *("a + b", "a - b", "a * b", "a / b", "a ** b", "-a", "a < b", "a <= b", "a > b", "a >= b", "a if b else c"),
+    *("a ^ b", "a // b", "a % b", "a == b", "a != b", "a < b < c", "a and b", "a or b", "not a", "a[0]", "e"),
+)
+"""Forms of Python that a person may try in an equation."""
+
+
+def is_allowed(text: str) -> bool:
+    """Return True if the parser of equations reads ``text`` in the variables a, b and c."""
+    try:
+        parse(Builder(("a", "b", "c")), {"x": text}, ["x"])
+    except EquationError:
+        return False
+    return True
+
+
+def _code(texts: Iterable[str]) -> str:
+    return ", ".join(f"`{text}`" for text in texts)
+
+
+def _one_of(words: Iterable[str]) -> str:
+    *most, last = words
+    return f"{', '.join(most)} or {last}"
+
+
+def _needing(signal: str) -> str:
+    """Return the effects that need a recorded signal."""
+    return _code(name for name, effect in EFFECTS.items() if signal in about(effect)) or "none"
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 120, break_long_words=False, break_on_hyphens=False))
 
 
 def written() -> str:
