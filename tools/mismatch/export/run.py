@@ -52,10 +52,10 @@ class Residual:
 
     def text(self) -> str:
         """Return the row as a sentence; the scatter is in it where a constant offset is a notable part of the rms."""
-        said = f"{self.output}: residual {self.rms:.4g} {self.unit} rms{self.where}"
+        line = f"{self.output}: residual {self.rms:.4g} {self.unit} rms{self.where}"
         if self.scatter < LEAST_OFFSET * self.rms:
-            said += f" ({self.scatter:.4g} {self.unit} about its mean of {self.mean:.4g} {self.unit})"
-        return said if self.share is None else f"{said}, {percent(self.share)} of the recording's standard deviation"
+            line += f" ({self.scatter:.4g} {self.unit} about its mean of {self.mean:.4g} {self.unit})"
+        return line if self.share is None else f"{line}, {percent(self.share)} of the recording's standard deviation"
 
 
 def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
