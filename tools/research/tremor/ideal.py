@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
-from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
 from firmware_py.tremor.estimator import Estimator
 from hal.arrays import Array
 from hal.bench import load_bench
@@ -83,6 +83,8 @@ def ideal_changes(noise: bool) -> dict[str, Any]:
     emulation: dict[str, Any] = dict(PERFECT_EMULATION)
     # the bound pays nothing for what its filter passes above the band, so neither do filter and strokes beside it
     adaptive: dict[str, Any] = {"quiet": 0.0, "above": 1.0, "core_above": 0.0}
+    # the bench's figure holds the noise of its converter; the ideal converter has steps alone
+    adaptive["reading_noise_m_s2"] = AdaptiveConfig().reading_noise_m_s2
     if not noise:
         emulation = merged(emulation, {"sensors": {"noise_ug_per_rtHz": 0.0}})
         # the estimator takes the sensors' noise out of what it learns, so it must know that there is none
