@@ -577,7 +577,7 @@ static int estimate(double *f, estimate_state *s, const estimate_params *p)
         f[TREMOR + i] = s->out[0][i] = now;
         f[TREMOR_AHEAD + i] = s->out[1][i] = ahead;
         f[TREMOR_CORE + i] = s->out[5][i] = out[2];
-        f[TREMOR_FREQUENCY + i] = s->out[2][i] = s->combiner[i].wflc.omega * p->combiner.seen.tick_hz / (2.0 * PI);
+        f[TREMOR_FREQUENCY + i] = s->out[2][i] = s->combiner[i].wflc.omega * p->combiner.sensor.tick_hz / (2.0 * PI);
         f[TREMOR_AMPLITUDE + i] = s->out[3][i] = sqrt(2.0 * s->power[i]);
         double trust = 0.0;
         if (s->ticks > p->settle_ticks && !(p->needs_lock && s->combiner[i].wflc.miss > 0.7)) {

@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hal.arrays import Array
+Array = NDArray[np.float64]
 
 STEPS_HZ = 6000.0  # of the integration
 VARIANTS = {

@@ -14,7 +14,7 @@ from firmware_py.live.link import LiveLink
 from firmware_py.run.findings import Finding
 from firmware_py.run.host_gaps import HostGaps
 from firmware_py.run.incidents import Incidents, LoopCounts, Recorder
-from firmware_py.run.safety import SafetyLimits, State, Supervisor
+from firmware_py.run.safety import SafetyLimits, State, Supervisor, ramp_ticks_at
 from firmware_py.run.signals import Signals
 from firmware_py.scheduler.scheduler import Scheduler
 from firmware_py.scheduler.ticker import Ticks
@@ -70,7 +70,7 @@ class Run:
     """True once the operator has interrupted a ramp that is retried."""
 
     def __post_init__(self) -> None:
-        self.supervisor = Supervisor(self.output)
+        self.supervisor = Supervisor(self.output, ramp_ticks_at(self.period_ns))
         self.incidents = Incidents(
             self.supervisor,
             self.counts,

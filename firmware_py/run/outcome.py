@@ -9,7 +9,6 @@ from typing import Any
 from firmware_py.recording.recorder import RecordingSummary
 from firmware_py.run.context import Run
 from firmware_py.run.host_gaps import HostGaps
-from firmware_py.run.safety import RAMP_TICKS
 from firmware_py.run_request import RunRequest
 from firmware_py.scheduler.realtime import RealtimeReport
 from hal.bench import OpenBench
@@ -114,7 +113,7 @@ def _safe_state(run: Run, guardian: Mapping[str, Any]) -> dict[str, Any]:
     late_ms = None
     on_time = supervisor.safe_reached and not supervisor.was_late
     took_ms = (reached_ns - trip.t_ns) * 1e-6 if trip is not None and reached_ns and reached else 0.0
-    if took_ms > 0.0 and not (on_time and took_ms <= (RAMP_TICKS + 1) * run.period_ns * 1e-6):
+    if took_ms > 0.0 and not (on_time and took_ms <= (supervisor.ramp_ticks + 1) * run.period_ns * 1e-6):
         late_ms = took_ms
         reason += f"; neutral was confirmed only after {late_ms:.0f} ms"
     return {

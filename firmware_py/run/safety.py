@@ -24,6 +24,7 @@ from hal.validation import StrictTable
 RAMP_TICKS = 20
 """Ticks from the decision to neutral, 20 ms at 1 kHz. The driver's ramp is shorter (``drivers.output_guard_steps``:
 ``RAMP_STEPS`` of 1 ms each), so that steps can be retried."""
+RAMP_NS = 20_000_000
 ATTEMPTS = 3
 """Largest number of attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of a transfer's time."""
 
@@ -134,12 +135,19 @@ class Hold:
     neutral_ns: int | None = None
 
 
+def ramp_ticks_at(period_ns: int) -> int:
+    """Return ``RAMP_TICKS``, or the ticks of 20 ms where a tick is shorter than 1 ms: a wire takes its time."""
+    return max(RAMP_TICKS, -(-RAMP_NS // period_ns))
+
+
 class Supervisor:
     """Owns the permission to move. It arms and ramps ``output`` and uses no other device; an instrument without outputs
     (``None``) is at neutral at once."""
 
-    def __init__(self, output: AnalogOutput | None) -> None:
+    def __init__(self, output: AnalogOutput | None, ramp_ticks: int = RAMP_TICKS) -> None:
         self._output = output
+        self.ramp_ticks = ramp_ticks
+        """Ticks within which the ramp is expected to end; it is retried after twice as many."""
         self._ramp_ticks = 0
         self.state = State.BOOT
         self.trip_cause: Trip | None = None
@@ -173,7 +181,7 @@ class Supervisor:
     @property
     def is_retrying(self) -> bool:
         """True while a ramp that failed within its time is retried, until it succeeds or is given up."""
-        return self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS
+        return self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * self.ramp_ticks
 
     @property
     def is_holding(self) -> bool:
@@ -269,7 +277,7 @@ class Supervisor:
             self.was_late = self.is_retrying
             self.safe_reached = self.state is State.SAFE_RAMP
             self.state = State.SAFE if self.safe_reached else State.HOLD
-        elif self._ramp_ticks >= 2 * RAMP_TICKS:
+        elif self._ramp_ticks >= 2 * self.ramp_ticks:
             self._handle_late_ramp(may_retry)
         return self.state is State.SAFE
 

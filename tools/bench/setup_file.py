@@ -129,7 +129,8 @@ def _inputs(given: Any) -> dict[str, int]:
 
 
 STILL_TIP = (
-    "[firmware.tremor.adaptive]", 'preset = "still tip"', "", "[firmware.actuation]", "centring = 1.0",
+    "[firmware.tremor.adaptive]", 'preset = "still tip"', "reading_noise_m_s2 = 4.2e-3", "",
+    "[firmware.actuation]", "centring = 1.0",
 )  # fmt: skip
 """The project's own benches have these where the output takes a command a tick (``AdaptiveConfig.preset``)."""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.run.findings import CauseClass, Finding
-from firmware_py.run.safety import RAMP_TICKS, State, Supervisor, Trip
+from firmware_py.run.safety import RAMP_TICKS, State, Supervisor, Trip, ramp_ticks_at
 from hal.arrays import Array
 from hal.errors import I2cNack, SafetyTrip
 from hal.types import OutputLimit
@@ -306,3 +306,13 @@ def test_states_have_words_for_people():
     assert [state.words for state in (State.RUNNING, State.HOLD_RAMP, State.HOLD, State.SAFE_RAMP)] == [
         "running", "hold", "hold", "safe ramp",
     ]  # fmt: skip
+
+
+def test_a_ramp_at_a_fast_tick_has_the_same_time() -> None:
+    assert [ramp_ticks_at(period) for period in (2_000_000, 1_000_000, 500_000, 250_000)] == [20, 20, 40, 80]
+    supervisor = Supervisor(FakeAmplifier(ticks=60), ramp_ticks_at(250_000))
+    supervisor.begin_self_test()
+    supervisor.arm()
+    supervisor.trip(Finding.FINISHED, "run finished", tick=1, t_ns=1)
+    assert [supervisor.step() for _ in range(60)] == [False] * 59 + [True]
+    assert not supervisor.was_late
