@@ -1,6 +1,6 @@
 """Decides whether the actuators may move: the supervisor is one state machine.
 
-Outputs are armed only after the self-test. Whatever goes wrong, the amplifier ramps to neutral within ``RAMP_TICKS``.
+Outputs are armed only after the self-test. Whatever goes wrong, the amplifier ramps to neutral (``ramp_ticks_at``).
 After a latched finding it stays there, and the first reason wins. After a recoverable one it holds there until
 ``Holds`` lets it resume::
 
@@ -25,6 +25,7 @@ RAMP_TICKS = 20
 """Ticks from the decision to neutral, 20 ms at 1 kHz. The driver's ramp is shorter (``drivers.output_guard_steps``:
 ``RAMP_STEPS`` of 1 ms each), so that steps can be retried."""
 RAMP_NS = 20_000_000
+"""Least time from the decision to neutral that an amplifier has, at any tick rate."""
 ATTEMPTS = 3
 """Largest number of attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of a transfer's time."""
 

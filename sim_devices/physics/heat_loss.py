@@ -16,7 +16,7 @@ KELVIN = "kelvin"
 TEMPERATURES = ("degC", "K")
 """Units of the states that lose heat."""
 POWER = 1.25
-"""Exponent of laminar natural convection: Nusselt numbers go with the root of the root of Rayleigh numbers."""
+"""Exponent of laminar natural convection: the Nusselt number goes with the Rayleigh number to the power 1/4."""
 
 
 def _settings(x: Array, residual: Array, ctx: Context) -> Settings:

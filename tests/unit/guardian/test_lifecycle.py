@@ -1,4 +1,4 @@
-"""What the firmware does about a guardian that is gone, is silent or does not come back; nobody arms without one."""
+"""The firmware replaces a guardian that is gone or silent, and arms no output without one."""
 
 from __future__ import annotations
 
