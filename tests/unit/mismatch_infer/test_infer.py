@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.signal import lfilter
+from scipy.stats import beta
 from scipy.stats import t as student
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.screen import places
 from tools.mismatch.infer import density, diagnose
-from tools.mismatch.infer.constants import START, Constants, learned
+from tools.mismatch.infer.constants import START, Constants, constants_for, learned, vouched
 from tools.mismatch.infer.count import Count
 from tools.mismatch.infer.decide import TESTED, accepted, dispensable, is_whole, log_odds, stated, surenesses
 from tools.mismatch.infer.density import DEGREES, NORMAL, student_log_density, student_scale
@@ -131,6 +132,18 @@ def test_the_shipped_constants_are_complete() -> None:
     c = learned()
     assert Constants.of(c.to_json()) == c
     assert min(c.samples, c.per_name, c.per_parameter, c.least_z, c.sure_slope) > 0
+
+
+def test_strangers_machines_limit_what_is_stated_for_a_kind_of_twin_that_the_calibration_lacks() -> None:
+    known = vouched("ode")
+    assert known is not None
+    # the posterior mean of a share with a uniform prior is that of a beta distribution
+    assert known.most == pytest.approx(beta(known.right + 1, known.names - known.right + 1).mean())
+    c = constants_for("ode")
+    assert stated(1.0, True, c) == known.most < stated(1.0, True, learned())
+    assert stated(0.1, True, c) == stated(0.1, True, learned())
+    assert vouched("piezo_stack") is None
+    assert constants_for("piezo_stack") == learned()
 
 
 def _stack(change: np.ndarray, u: np.ndarray) -> Recording:

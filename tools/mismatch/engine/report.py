@@ -77,6 +77,19 @@ class PhysicsFound:
 
 
 @dataclass(frozen=True)
+class Vouched:
+    """Counts the ``names`` above a half on strangers' machines, and those of them that were ``right``."""
+
+    names: int
+    right: int
+
+    @property
+    def most(self) -> float:
+        """Return the probability that may be stated at most, by the rule of succession (Laplace 1774)."""
+        return (self.right + 1) / (self.names + 2)
+
+
+@dataclass(frozen=True)
 class Withheld:
     """Holds an effect that lowered the residual and is not named.
 
@@ -321,6 +334,8 @@ class Report:
     """Differences between recordings that were diagnosed together."""
     not_tried: str = ""
     """Sentence on the effects that this kind of twin cannot have, and the kind that can."""
+    vouched: Vouched | None = None
+    """Names on strangers' machines, which limit what is stated for this kind of twin; None: the calibration has it."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON of the contract, with additional optional keys; numbers are finite or null."""
@@ -328,4 +343,6 @@ class Report:
         body.pop("pictures")
         if self.together is None:
             body.pop("together")
+        if self.vouched is None:
+            body.pop("vouched")
         return to_jsonable({"format": 1, **body})

@@ -1,15 +1,21 @@
-"""Loads the learned constants of the decision. Only ``micron mismatch calibrate`` writes ``constants.json``."""
+"""Loads the learned constants of the decision. Only ``micron mismatch calibrate`` writes ``constants.json``.
+
+``strangers.json`` counts the names above a half on machines that people who knew nothing of the engine simulated.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from tools.mismatch.engine.report import Vouched
+
 FILE = Path(__file__).with_name("constants.json")
+STRANGERS = FILE.with_name("strangers.json")
 
 
 @dataclass(frozen=True)
@@ -54,3 +60,21 @@ prototype found on cases of another generator."""
 def learned() -> Constants:
     """Return the constants in use."""
     return Constants.of(json.loads(FILE.read_text())["constants"])
+
+
+@cache
+def vouched(kind: str) -> Vouched | None:
+    """Return what strangers' machines say of the names for a ``kind`` of twin that the corpus of the calibration lacks.
+
+    None: the corpus has the kind.
+    """
+    body = json.loads(STRANGERS.read_text())
+    if kind not in body["kinds"]:
+        return None
+    return Vouched(*(sum(int(s[k]) for s in body["sets"]) for k in ("names", "right")))
+
+
+def constants_for(kind: str) -> Constants:
+    """Return the constants in use for a ``kind`` of twin: strangers' machines limit what is stated of theirs."""
+    c, known = learned(), vouched(kind)
+    return c if known is None else replace(c, most_sure=min(c.most_sure, known.most))

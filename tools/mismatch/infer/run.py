@@ -21,7 +21,7 @@ from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.borne_out import doubts_of
-from tools.mismatch.infer.constants import Constants, learned
+from tools.mismatch.infer.constants import Constants, constants_for, vouched
 from tools.mismatch.infer.decide import (
     LIKELY,
     Answer,
@@ -74,11 +74,14 @@ def diagnose(
     recording: Recording, *, held_out: float = 0.3, seed: int = 0, jobs: int = 2, progress: Progress | None = None,
     effects: Iterable[Effect] | None = None, constants: Constants | None = None,
 ) -> Report:  # fmt: skip
-    """Locate the mismatch, name the physics and state its probability; ``constants`` default to the learned ones."""
+    """Locate the mismatch, name the physics and state its probability.
+
+    ``constants`` default to those for the kind of twin.
+    """
     began = time.perf_counter()
     find = partial(
-        infer, constants=constants or learned(), held_out=held_out, seed=seed, jobs=jobs, progress=progress,
-        effects=effects,
+        infer, constants=constants or constants_for(recording.twin.kind), held_out=held_out, seed=seed, jobs=jobs,
+        progress=progress, effects=effects,
     )  # fmt: skip
     inferred = find(recording)
     with threadpool_limits(1), np.errstate(all="ignore"):
@@ -88,7 +91,8 @@ def diagnose(
             inferred = replace(inferred, posed=replace(inferred.posed, holds={**inferred.posed.holds, **held}))
             answer = decide(inferred.found.store, inferred.found.first)
         report = report_of(inferred, answer, held_out, jobs)
-    return replace(report, seconds=time.perf_counter() - began)
+    known = vouched(recording.twin.kind) if constants is None and report.physics else None
+    return replace(report, vouched=known, seconds=time.perf_counter() - began)
 
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:

@@ -62,6 +62,7 @@ def html_page(report: Report) -> str:
         meaning=wording.meaning(report),
         physics_title=wording.physics_title(report),
         hold=wording.hold(report),
+        vouched=wording.vouched(report.vouched) if report.vouched else "",
     )
 
 

@@ -122,6 +122,8 @@ def _checks(report: Report) -> Table:
     ]
     if c.memory_p_value < 1e-3:
         rows.append(("memory", f"history helps beyond the present ({chance(c.memory_p_value)}): a state is missing"))
+    if report.vouched:
+        rows.append(("sure", wording.vouched(report.vouched)))
     if report.hold:
         rows.append(("inputs", wording.hold(report)))
     rows += [("look at", m) for m in wording.cautions(report)]

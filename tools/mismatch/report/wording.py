@@ -15,6 +15,7 @@ from tools.mismatch.engine.report import (
     ParameterValue,
     PhysicsFound,
     Report,
+    Vouched,
     Withheld,
 )
 
@@ -276,6 +277,14 @@ def sure(report: Report, p: PhysicsFound) -> str:
         return text
     fit = "fits" if len(rivals) == 1 else "fit"
     return f"{text}, a probability shared with {', '.join(dict.fromkeys(rivals))}, which {fit} as well"
+
+
+def vouched(known: Vouched) -> str:
+    """Return why no name is surer."""
+    return (
+        f"no name is surer than {percent(known.most)}: on machines of people who did not write the engine"
+        f" {known.right} of {known.names} names above 50 % were right"
+    )
 
 
 def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:
