@@ -27,6 +27,7 @@ from tools.mismatch.new import new_recording
 from tools.mismatch.recording_columns import SUFFIXES
 from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.recording_units import SI
+from tools.mismatch.report.vocabulary import entries
 from tools.mismatch.text_table import SUFFIXES as TEXT
 from tools.mismatch.twins.program import parse
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
@@ -109,15 +110,15 @@ Where inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give ea
 `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function. An output that has the name of a state is converted to the state's
-unit. The engine tries missing forces at every state, play between two bodies that a spring joins, and parameters that
-differ with the direction of motion:
+unit; one with an equation of its own has the unit of its column. The engine tries [what can be named](#what-can-be-named)
+at inputs and outputs, at every state, and between two bodies that a spring joins:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
 kind = "ode"
 
 [twin.states]
-speed = "rad/s"          # or { unit = "rad/s", start = 0.0 }
+speed = "rad/s"          # or { unit = "rad/s", start = 0.0 }, where the search for its start begins
 
 [twin.equations]         # the derivative of each state
 speed = "(torque_per_A * current - bearing * speed) / inertia"
@@ -130,8 +131,8 @@ fixed = ["inertia"]      # the data show only ratios of the three, so one must b
 hold = "zero"
 ```
 
-The keys of a kind stand in `[twin.parameters]`. The tables of an `ode` may stand there or, as here, in `[twin]`:
-`[twin.units]` and `[twin.parameters.units]` are the same; so are the `states` of a `state_space`.
+The keys of a kind stand in `[twin.parameters]`. Of an `ode` the tables `states`, `equations`, `outputs`, `offsets` and
+`units` may stand there or, as here, in `[twin]`; so may the `states` of a `state_space`.
 
 {equations}
 
@@ -144,10 +145,12 @@ def derivatives(t, states, inputs, parameters):
 ```
 
 The function is called once, with symbols, and becomes equations. `math.sin`, Python's `max` and an `if` need numbers
-and fail. The file runs after `micron trust .` ([a twin of your own](adding/twin.md)).
+and fail. The file runs after `micron trust .`. A program that simulates by itself is
+[a twin of your own](adding/twin.md).
 
 {si}
-Units of other dimensions stay as recorded, and so do degC and % (12 % is 12). Its poles, the numerators from each input
+Units of other dimensions stay as recorded, and so do degC and % (12 % is 12); an `ode` leaves degC as it is, too. Its
+poles, the numerators from each input
 to each output and `y0` are re-fitted, because the data do not tell one choice of states from another.
 Equations of an `ode` are read
 in the units of the columns unless `units` says otherwise: after `units = { current = "A", bearing = "N m s" }` the fan
@@ -175,8 +178,8 @@ unit = "mm"
 ```
 
 `micron mismatch simulate .` runs the twin that the recording describes and prints what was read (samples, rate, units,
-holds, notes) and the residual. A wrong unit or sign shows here, before the diagnosis. The first command of a version
-compiles for a minute or more. `micron mismatch physics` lists what can be named.
+holds, notes) and the residual. A wrong unit or sign shows here, before the diagnosis. An input without `hold` runs
+straight here; `diagnose` infers its course. The first command of a version compiles for a minute or more.
 
 Name the commanded value as input where there is one. A measured input has noise. An effect that smooths this noise (a
 lag, a resonance) then predicts better, although the machine has no such effect. State the input's `noise_rms`, and the
@@ -186,7 +189,7 @@ engine uses the input's expected course and counts the rest of its noise as nois
 
 `micron mismatch diagnose` reports where recording and twin differ and which physics is missing. Its verdict is
 {verdicts}
-([how to read it](mismatch.md#reading-a-report)). `--held-out 0.3` hides that share of each of a few stretches from the
+([how to read it](mismatch.md#reading-a-report)); the last says that something real is left which no effect explains. `--held-out 0.3` hides that share of each of a few stretches from the
 fit, so a slow drift lies in fitted and hidden samples alike. `apply` writes the corrected twin in the format of the
 file's ending:
 
@@ -255,6 +258,14 @@ def page() -> str:
         "|---|---|---|",
         *(f"| `{s}` | {' or '.join(u)} | {_needing(s)} |" for s, u in CONTEXT_UNITS.items()),
         "| any other name | any | none, but each parameter of an `ode` may be found to follow it |",
+        "",
+        "## What can be named",
+        "",
+        "`micron mismatch physics` prints formulas, parameters, sources and what shows each.",
+        "",
+        "| name | physics | acts |",
+        "|---|---|---|",
+        *(f"| `{e.name}` | {_cell(e.summary)} | {_cell(e.acts)} |" for e in entries()),
         "",
     ]
     return "\n".join(lines)
