@@ -27,6 +27,7 @@ from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
 from sim_devices.physics.load import CONSTANT_LOAD
 from sim_devices.physics.parameter import DIRECTION_DEPENDENCE, PARAMETER_VARIATION
+from sim_devices.physics.proportional import LINEAR_LOSS, LINEAR_STIFFNESS, VISCOUS_FRICTION
 from sim_devices.physics.quantization import QUANTIZATION
 from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
@@ -89,6 +90,9 @@ _ALL = (
     CONSTANT_LOAD,
     SCALE_ERROR,
     ZERO_ERROR,
+    VISCOUS_FRICTION,
+    LINEAR_STIFFNESS,
+    LINEAR_LOSS,
 )
 
 

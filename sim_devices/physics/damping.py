@@ -34,6 +34,7 @@ AMPLITUDE_DAMPING = Effect(
     name="amplitude_dependent_damping",
     summary="damping that grows or falls with the deflection",
     kind="feedback",
+    by_position=True,
     stages=("mechanics",),
     parts=lambda settings: Parts((), (Parameter("growth", "1/({out}^2 s)"),)),
     equation=r"m\ddot x + (c + c_x x^2)\dot x + k x = F",

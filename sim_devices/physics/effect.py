@@ -257,6 +257,8 @@ class Effect:
     """Units of which the position must have one for a feedback effect; empty: any."""
     not_units: tuple[str, ...] = ()
     """Units that the position cannot have: no temperature flows over."""
+    by_position: bool = False
+    """True of a feedback effect that a velocity alone, of which the equations have no position, cannot have."""
     twins: tuple[str, ...] = ()
     """Twin kinds that can have the effect; empty: all."""
     available: Callable[[Mapping[str, Array], str], str] | None = None
@@ -301,14 +303,15 @@ class Effect:
     supported by the data."""
 
     proportional: bool = False
-    """True if an effect of kind add is proportional to the signal. Behind columns of simulated output it cannot be
+    """True if an effect of kind add or feedback is proportional to the signal, position or velocity. Behind columns of simulated output it cannot be
     distinguished from wrong parameters of the simulation."""
 
     loses_mean: bool = False
     """True if a constant signal does not pass the effect."""
 
     shifts_line: bool = False
-    """True if it changes a gain or a zero alone: it has no place where the simulation's own are re-fitted."""
+    """True if it changes a gain, a zero or a linear term alone: it has no place where the simulation's own are
+    re-fitted."""
 
     @property
     def is_linear(self) -> bool:

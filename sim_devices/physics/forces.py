@@ -16,8 +16,9 @@ from sim_devices.physics.effect import Array, Context
 FRICTION = 8
 """Level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness, lean of a loop, and
 1 if the extra falls with the exponential of the speed, 0 if with that of its square."""
-# cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre, constant force
-SPRING = 10
+# cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre, constant force,
+# damping
+SPRING = 11
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
 COGGING = 7  # period, sin1, cos1, sin2, cos2; sine and cosine of the angle itself (gravity)
 FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
@@ -119,7 +120,7 @@ def smooth_force(p, v, spring, cogging, friction, place):
     q = p * p
     f = -(spring[k] + spring[k + 3] * q) * q * p - spring[k + 1] * q - spring[k + 2] * p
     f += spring[k + 9] - friction[place * FRICTION + 4] * abs(v)
-    f -= (spring[k + 4] * abs(v) + spring[k + 5] * q) * v
+    f -= (spring[k + 4] * abs(v) + spring[k + 5] * q + spring[k + 10]) * v
     if spring[k + 6] != 0.0:
         d = p - spring[k + 8]
         f -= spring[k + 6] * (d - min(max(d, -spring[k + 7]), spring[k + 7]))

@@ -52,4 +52,7 @@ NAMES = (
     "constant_load",
     "scale_error",
     "zero_error",
+    "viscous_friction",
+    "linear_stiffness",
+    "linear_loss",
 )

@@ -86,7 +86,8 @@ def _acts_at(twin: Twin, effect: Effect) -> list[Place]:
     def fits(unit: str) -> bool:
         return unit not in effect.not_units and (not effect.position_units or unit in effect.position_units)
 
-    return [p for p in places_of(twin) if p.kind in effect.acts_on and fits(_position_unit(twin, p))]
+    at = (p for p in places_of(twin) if not (effect.by_position and p.kind == "motion" and p.position == p.velocity))
+    return [p for p in at if p.kind in effect.acts_on and fits(_position_unit(twin, p))]
 
 
 def _position_unit(twin: Twin, place: Place) -> str:

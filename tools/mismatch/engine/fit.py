@@ -18,7 +18,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected, Shrunk
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.trust import belief, fit_loss, stayed, to_search
-from tools.mismatch.placed import Free
+from tools.mismatch.placed import Free, Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.ode import inside_of
 
@@ -72,9 +72,10 @@ def _backward(p: Free, v: float) -> float:
     return _inside(p, float(np.exp(min(v, 700.0))) if p.log and p.lo > 0 else v)
 
 
-STEP, STEP_INSIDE = 1e-3, 0.03
-"""Step of a sensitivity, relative to the parameter, and the same where forces act inside differential equations. Bodies
-stick and slip at samples that jump from step to step, and the difference must span many of them."""
+STEP, STEP_STICKING = 1e-3, 0.03
+"""Step of a sensitivity, relative to the parameter, and the same where friction acts inside differential equations.
+Bodies stick and slip at samples that jump from step to step, and the difference must span many of them. Without
+friction it must be short: of a mode that hardly decays, the phase at the end of a stretch moves with every per cent."""
 
 
 def _step_size(p: Free, v: float, step: float) -> float:
@@ -90,10 +91,21 @@ def forces_inside(model: Model) -> bool:
     return inside_of(model.twin) is not None and any(p.site == "feedback" for p in model.placed)
 
 
+def sticks(model: Model) -> bool:
+    """Return True if friction acts inside differential equations."""
+    return forces_inside(model) and any("friction" in rows_of(p) for p in model.placed if p.site == "feedback")
+
+
+def rows_of(placed: Placed) -> Mapping[str, Array]:
+    """Return the packed rows of a force or flow whose parameters are one."""
+    parts, fill = placed.parts, placed.effect.fill
+    return fill(np.ones(len(parts.nonlinear)), np.ones(len(parts.weights)), placed.settings) if fill else {}
+
+
 def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     """Return ``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
     p = model.parameters[i]
-    z, h = to_search(p, theta[i]), _step_size(p, theta[i], STEP_INSIDE if forces_inside(model) else STEP)
+    z, h = to_search(p, theta[i]), _step_size(p, theta[i], STEP_STICKING if sticks(model) else STEP)
     shifted = theta.copy()
     shifted[i] = _backward(p, z + h)
     if shifted[i] == theta[i]:

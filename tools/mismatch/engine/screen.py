@@ -98,8 +98,12 @@ ROWS = 12_000  # number of rows of the fit that a screen uses
 OWN_SHARE = 0.05  # least share of the residual of the engineer's base that an effect must explain by itself
 
 
-def bend(problem: Problem, current: Fit) -> Ground:
-    """Return the common data of the candidates, with sensitivities by forward differences."""
+STEP = 1e-3  # of a parameter, for its sensitivities
+
+
+def bend(problem: Problem, current: Fit, step: float = STEP) -> Ground:
+    """Return the common data of the candidates, with sensitivities by forward differences over ``step`` of each
+    parameter."""
     model, theta = current.model, current.theta
     rows = spread(problem.fit_rows, ROWS, problem.seed)
     samples = problem.index[rows]
@@ -109,7 +113,7 @@ def bend(problem: Problem, current: Fit) -> Ground:
     base = model.simulate(view, theta)  # the others start near it
     for c, i in enumerate(model.nonlinear):
         p = model.parameters[i]
-        h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
+        h = step * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
         shifted = theta.copy()
         shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
         for o, y in model.simulate(view, shifted, model.moved_by(i)).items():

@@ -466,6 +466,10 @@ def _spring(s: Slot) -> ForceCode:
     return ForceCode("".join(f" - {s.at(n)} * {powers[n]}" for n in s.values))
 
 
+def _linear_spring(s: Slot) -> ForceCode:
+    return ForceCode(f" - {s.at('linear')} * x" + (f" + {s.at('preload')}" if "preload" in s.values else ""))
+
+
 def _clearance(s: Slot) -> ForceCode:
     inside = f"np.clip(x - {s.at('centre')}, -{s.at('half_gap')}, {s.at('half_gap')})"
     if "joint" in s.placed.effect.acts_on:
@@ -495,6 +499,9 @@ FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
     "amplitude_dependent_damping": lambda s: ForceCode(f" - {s.at('growth')} * x**2 * v"),
     "clearance": _clearance,
     "constant_load": lambda s: ForceCode(f" + {s.at('load')}"),
+    "viscous_friction": lambda s: ForceCode(f" - {s.at('viscous')} * v"),
+    "linear_stiffness": _linear_spring,
+    "linear_loss": lambda s: ForceCode(f" - {s.at('loss')} * x + {s.at('constant')}"),
 }
 
 

@@ -234,7 +234,8 @@ class EquationLines:
         if one.place.kind not in ("storage", "storages"):
             return []
         if name in FORCES:
-            return [f"rates[{one.place.target}] +={force(one.slot).smooth.removeprefix(' +')}"]
+            at, smooth = one.place.target, force(one.slot).smooth.removeprefix(" +")
+            return [f"x = s[{at}]", f"rates[{at}] +={smooth}"] if "x" in smooth else [f"rates[{at}] +={smooth}"]
         lines: list[str] = []
         settings = one.slot.placed.settings
         if name == "nonlinear_heat_loss":
