@@ -303,8 +303,8 @@ class Effect:
     supported by the data."""
 
     proportional: bool = False
-    """True if an effect of kind add or feedback is proportional to the signal, position or velocity. Behind columns of simulated output it cannot be
-    distinguished from wrong parameters of the simulation."""
+    """True if an effect of kind add or feedback is proportional to the signal, position or velocity. Behind columns of
+    simulated output it cannot be distinguished from wrong parameters of the simulation."""
 
     loses_mean: bool = False
     """True if a constant signal does not pass the effect."""

@@ -17,7 +17,7 @@ VISCOUS_FRICTION = Effect(
     stages=("mechanics",),
     parts=lambda settings: Parts((), (Parameter("viscous", "1/s"),)),
     equation=r"m\ddot x + k x = F - c\,\dot x",
-    source="B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, section 2 (viscous friction)",
+    source="B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, section 2",
     excitation="slow and fast motion",
     confusable_with=("coulomb_friction", "quadratic_drag"),
     basis=lambda x, ctx, q, settings: -velocity_of(x, ctx)[:, None],

@@ -13,19 +13,25 @@ from tools.mismatch.engine.pose import prepared
 RATE_HZ = 500.0
 GAIN = {"scale_error[displacement]", "scale_error[command]"}
 ZERO = "zero_error[displacement]"
+DAMPING, SPRING = "viscous_friction[speed]", "linear_stiffness[speed]"
 
 
 @pytest.mark.parametrize(
     ("equation", "fixed", "labels"),
     [
-        ("gain * command - drag * speed - pull * displacement", [], GAIN | {ZERO}),
+        ("gain * command - drag * speed - pull * displacement", [], GAIN | {ZERO, DAMPING, SPRING}),
         # the gain of a command that is known is another thing, and so is that of a pendulum's sensor
-        ("gain * command - drag * speed - pull * displacement", ["gain"], {ZERO}),
+        ("gain * command - drag * speed - pull * displacement", ["gain"], {ZERO, DAMPING, SPRING}),
         (
             "gain * command - drag * speed - pull * sin(displacement)",
             [],
-            {"scale_error[command]", ZERO},
+            {"scale_error[command]", ZERO, DAMPING},
         ),
+        # a term that the twin has is its own; one that it lacks, or knows, may be missing
+        ("gain * command - pull * displacement", ["drag"], GAIN | {ZERO, SPRING}),
+        ("gain * command - drag * speed - pull * displacement", ["drag", "gain"], {ZERO, SPRING}),
+        # the start state takes a zero where nothing holds the position
+        ("gain * command - drag * speed", ["pull"], GAIN | {DAMPING}),
     ],
 )
 def test_only_what_the_parameters_do_exactly_is_theirs(equation: str, fixed: list[str], labels: set[str]) -> None:
@@ -46,5 +52,6 @@ def test_only_what_the_parameters_do_exactly_is_theirs(equation: str, fixed: lis
     }
     made = recording("ode", {"command": u}, {"displacement": y + rng.normal(0.0, 1e-3, n)}, own, rate_hz=RATE_HZ)
     problem, _, base = prepared(made, 0.3, 0, False)
-    lines = [EFFECTS[name] for name in ("scale_error", "zero_error", "constant_load", "saturation")]
+    linear = ("viscous_friction", "linear_stiffness", "linear_loss")
+    lines = [EFFECTS[name] for name in ("scale_error", "zero_error", *linear, "constant_load", "saturation")]
     assert imitated(problem, base, lines) == labels

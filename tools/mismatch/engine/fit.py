@@ -73,9 +73,9 @@ def _backward(p: Free, v: float) -> float:
 
 
 STEP, STEP_STICKING = 1e-3, 0.03
-"""Step of a sensitivity, relative to the parameter, and the same where friction acts inside differential equations.
-Bodies stick and slip at samples that jump from step to step, and the difference must span many of them. Without
-friction it must be short: of a mode that hardly decays, the phase at the end of a stretch moves with every per cent."""
+"""Step of a sensitivity, relative to the parameter, and the one tried first where friction acts inside differential
+equations. Bodies stick and slip at samples that jump from step to step, and the difference must span many of them. The
+other is short: of a mode that hardly decays, the phase at the end of a stretch moves with every per cent."""
 
 
 def _step_size(p: Free, v: float, step: float) -> float:
@@ -102,10 +102,16 @@ def rows_of(placed: Placed) -> Mapping[str, Array]:
     return fill(np.ones(len(parts.nonlinear)), np.ones(len(parts.weights)), placed.settings) if fill else {}
 
 
-def moved_a_little(model: Model, theta: Array, i: int) -> Array:
-    """Return ``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
+def steps_of(model: Model) -> tuple[float, ...]:
+    """Return the steps of sensitivities, relative to the parameter, in the order in which they are tried."""
+    return (STEP_STICKING, STEP) if sticks(model) else (STEP,)
+
+
+def moved_a_little(model: Model, theta: Array, i: int, step: float | None = None) -> Array:
+    """Return ``theta`` with parameter ``i`` moved by a small step, by default the first of ``steps_of``, inside its
+    bounds."""
     p = model.parameters[i]
-    z, h = to_search(p, theta[i]), _step_size(p, theta[i], STEP_STICKING if sticks(model) else STEP)
+    z, h = to_search(p, theta[i]), _step_size(p, theta[i], steps_of(model)[0] if step is None else step)
     shifted = theta.copy()
     shifted[i] = _backward(p, z + h)
     if shifted[i] == theta[i]:
@@ -113,8 +119,9 @@ def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     return shifted
 
 
-def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
-    """Return the sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences.
+def slopes(projected: Projected, theta: Array, residual: Array, step: float | None = None) -> Array:
+    """Return the sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences
+    over ``step`` of each, by default the first of ``steps_of``.
 
     A parameter that moves only some outputs is simulated on these.
     """
@@ -123,7 +130,7 @@ def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
     parts = {projected.outputs: (projected, np.arange(residual.size), residual)}
     for c, i in enumerate(projected.free):
         p = model.parameters[i]
-        shifted = moved_a_little(model, theta, i)
+        shifted = moved_a_little(model, theta, i, step)
         moved = to_search(p, shifted[i]) - to_search(p, theta[i])
         if moved == 0.0:
             continue
@@ -169,17 +176,22 @@ def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, 
     return np.clip(found.x / scale, least, most)
 
 
+ROUGH = 1e-3
+"""Tolerance of searches that only rank candidates."""
+
+
 def search(
     projected: Projected, theta: Array, iterations: int, tolerance: float, jacobian: Array | None = None
 ) -> tuple[Array, float]:
     """Search by damped Gauss-Newton steps with bounds; return theta and the cost.
 
     Between steps the sensitivities are updated by the result of the step (Broyden, Mathematics of Computation 19, 1965)
-    and computed again only when that no longer decreases the cost. Those that are given as ``jacobian`` are only
-    updated.
+    and computed again only when that no longer decreases the cost, at last over a shorter step (``steps_of``) unless
+    the search is a ``ROUGH`` one. Those that are given as ``jacobian`` are only updated.
     """
     given = jacobian is not None
     model = projected.model
+    steps = steps_of(model)[: 1 if tolerance >= ROUGH else None]
     free = projected.free
     projected.anew()
     residual, theta = projected.evaluate(theta)
@@ -229,10 +241,11 @@ def search(
             damping *= 8
         if gain > tolerance:
             fresh = False
-        elif fresh or given:
+        elif given or (fresh and len(steps) == 1):
             break
         else:
-            jacobian = slopes(projected, theta, residual)
+            steps = steps[1:] if fresh else steps
+            jacobian = slopes(projected, theta, residual, steps[0])
             fresh = True
             damping = min(damping, 1e-2)
     return theta, cost
@@ -352,7 +365,7 @@ def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tupl
     ranked.sort(key=lambda r: r[1] not in of_base.values())
     tried: list[tuple[float, int, Array]] = []
     for _, i, theta in ranked[:tries]:
-        theta, cost = search(projected, theta, steps, 1e-3)
+        theta, cost = search(projected, theta, steps, ROUGH)
         tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
     tried.sort(key=lambda r: (r[0], r[1]))
     size = max(1.0, projected.usual_count)

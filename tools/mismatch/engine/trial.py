@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.fit import ROUGH, Fit, fit
 from tools.mismatch.engine.linearised import fit_beside
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, compare, misfits
@@ -112,7 +112,7 @@ def fit_one(
     thin = max(effort.stride, rows.size * len(now) // TRIAL_ROWS)
     begin = with_balance(problem, model, candidate.starts)
     fitted = fit(
-        problem, model, begin, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
+        problem, model, begin, stride=thin, iterations=20, tolerance=ROUGH, hopeless=limit,
         keep=current, touched=touched,
     )  # fmt: skip
     comparison = compare(problem, current, fitted)

@@ -110,8 +110,9 @@ Where inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give ea
 `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function. An output that has the name of a state is converted to the state's
-unit; one with an equation of its own has the unit of its column. The engine tries [what can be named](#what-can-be-named)
-at inputs and outputs, at every state, and between two bodies that a spring joins:
+unit; one with an equation of its own has the unit of its column. The engine tries
+[what can be named](#what-can-be-named) at inputs and outputs, at every state, and between two bodies that a spring
+joins:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
@@ -189,9 +190,9 @@ engine uses the input's expected course and counts the rest of its noise as nois
 
 `micron mismatch diagnose` reports where recording and twin differ and which physics is missing. Its verdict is
 {verdicts}
-([how to read it](mismatch.md#reading-a-report)); the last says that something real is left which no effect explains. `--held-out 0.3` hides that share of each of a few stretches from the
-fit, so a slow drift lies in fitted and hidden samples alike. `apply` writes the corrected twin in the format of the
-file's ending:
+([how to read it](mismatch.md#reading-a-report)); the last says that something real is left which no effect explains.
+`--held-out 0.3` hides that share of each of a few stretches from the fit, so a slow drift lies in fitted and hidden
+samples alike. `apply` writes the corrected twin in the format of the file's ending:
 
 {formats}
 
