@@ -20,6 +20,7 @@ FRICTION = 8
 # damping
 SPRING = 11
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
+OFFSET = "offset"  # fact of a twin: a constant force is a parameter of its own, or moves the zero of its output alone
 COGGING = 7  # period, sin1, cos1, sin2, cos2; sine and cosine of the angle itself (gravity)
 FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
 ROOT, ABOVE, CONVECTION, RADIATION_K, RADIATION_C = range(5)  # laws of a flow

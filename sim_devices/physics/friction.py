@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import FRICTION, base_moves, loop_along, packed
+from sim_devices.physics.forces import FRICTION, OFFSET, base_moves, loop_along, packed
 from sim_devices.physics.hysteresis import dahl
 from sim_devices.physics.statistics import Start, best_starts, smooth, thin
 
@@ -34,32 +34,56 @@ def soft_sign(v: Array) -> Array:
 
 def _no_settings(x: Array, residual: Array, ctx: Context) -> Settings:
     v = velocity_of(x, ctx)
-    return {"speed": (float(np.sqrt(np.mean(v[ctx.keep] ** 2))) or 1.0,)}
+    offset = {OFFSET: (1.0,)} if OFFSET in ctx.facts else {}
+    return {"speed": (float(np.sqrt(np.mean(v[ctx.keep] ** 2))) or 1.0,), **offset}
 
 
 _UNIT = "{out}/s^2"
 
 
+def _sided(settings: Settings) -> list[int]:
+    """Return which of level, asymmetry and viscous asymmetry are parameters.
+
+    A level that differs with the direction is one that does not beside a constant force, in motion and at rest. Where
+    the twin has such a force, the data show only their sum.
+    """
+    return [0, 2] if OFFSET in settings else [0, 1, 2]
+
+
+def _levels(w: Array, settings: Settings) -> Array:
+    """Return level, asymmetry and viscous asymmetry (3,) from the first of the weights ``w``."""
+    out = np.zeros(3)
+    at = _sided(settings)
+    out[at] = w[: len(at)]
+    return out
+
+
+_ROUGH = (0.0, 0.05, 0.05)  # penalties of level, asymmetry and viscous asymmetry
+
+
 def _coulomb_parts(settings: Settings) -> Parts:
-    return Parts(
-        (),
-        (Parameter("level", _UNIT, 0.0), Parameter("asymmetry", _UNIT), Parameter("viscous_asymmetry", "1/s")),
-        np.diag([0.0, 0.05, 0.05]),
-    )
+    every = Parameter("level", _UNIT, 0.0), Parameter("asymmetry", _UNIT), Parameter("viscous_asymmetry", "1/s")
+    at = _sided(settings)
+    return Parts((), tuple(every[i] for i in at), np.diag([_ROUGH[i] for i in at]))
 
 
 def _coulomb_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     v = velocity_of(x, ctx)
     s = soft_sign(v)
-    return -np.stack([s, s * s, np.abs(v)], axis=1)
+    return -np.stack([s, s * s, np.abs(v)], axis=1)[:, _sided(settings)]
+
+
+def _coulomb_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    return packed("friction", FRICTION, dict(zip((0, 1, 4), _levels(w, settings), strict=True)))
 
 
 def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
+    level, asymmetry, viscous = _levels(p, settings).tolist()
     return (
-        Human("coulomb_forward", float(p[0] + p[1]) / g, "{in}"),
-        Human("coulomb_backward", float(p[0] - p[1]) / g, "{in}"),
-        Human("viscous_difference", 2 * float(p[2]) / g, "{in} s/{out}"),
+        Human("coulomb_forward", (level + asymmetry) / g, "{in}"),
+        Human("coulomb_backward", (level - asymmetry) / g, "{in}"),
+        Human("viscous_difference", 2 * viscous / g, "{in} s/{out}"),
     )
 
 
@@ -214,7 +238,7 @@ _COULOMB = Effect(
     excitation="reversals of motion, at speeds that differ",
     prepare=_no_settings,
     basis=_coulomb_basis,
-    fill=lambda q, w, settings: packed("friction", FRICTION, {0: w[0], 1: w[1], 4: w[2]}),
+    fill=_coulomb_fill,
     report=_coulomb_report,
     vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
@@ -284,7 +308,7 @@ def _stribeck_parts(settings: Settings) -> Parts:
     return Parts(
         (Parameter("stribeck_speed", "{out}/s", 1e-3 * speed, 2 * speed, log=True, scale=0.05 * speed),),
         (*_coulomb_parts(settings).weights, Parameter("extra", _UNIT, 0.0)),
-        np.diag([0.0, 0.05, 0.05, 0.0]),
+        np.diag([*(_ROUGH[i] for i in _sided(settings)), 0.0]),
     )
 
 
@@ -310,25 +334,27 @@ def _slow_fall_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Ar
 
 
 def _stribeck_fill(q: Array, w: Array, settings: Settings, law: float = 0.0) -> dict[str, Array]:
-    return packed("friction", FRICTION, {0: w[0], 1: w[1], 4: w[2], 2: w[3], 3: q[0], 7: law})
+    level, asymmetry, viscous = _levels(w, settings).tolist()
+    return packed("friction", FRICTION, {0: level, 1: asymmetry, 4: viscous, 2: w[-1], 3: q[0], 7: law})
 
 
 def _stribeck_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     coulomb = [ctx.to_output(c) for c in _coulomb_basis(x, ctx, np.zeros(1), settings).T]
     grid = [(vs,) for vs in (settings["speed"][0] * np.geomspace(0.01, 1.0, 8)).tolist()]
-    extra = lambda q: _stribeck_basis(x, ctx, np.array(q), settings)[:, 3]  # noqa: E731
+    extra = lambda q: _stribeck_basis(x, ctx, np.array(q), settings)[:, -1]  # noqa: E731
     return _best(extra, grid, residual, ctx, coulomb)[:2]
 
 
 def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
+    level, asymmetry, viscous = _levels(p[1:], settings).tolist()
     return (
-        Human("coulomb_forward", float(p[1] + p[2]) / g, "{in}"),
-        Human("coulomb_backward", float(p[1] - p[2]) / g, "{in}"),
-        Human("static_friction", float(p[1] + p[4]) / g, "{in}"),
-        Human("rise_at_rest", float(p[4]) / g, "{in}"),
+        Human("coulomb_forward", (level + asymmetry) / g, "{in}"),
+        Human("coulomb_backward", (level - asymmetry) / g, "{in}"),
+        Human("static_friction", (level + float(p[-1])) / g, "{in}"),
+        Human("rise_at_rest", float(p[-1]) / g, "{in}"),
         Human("stribeck_speed", float(p[0]), "{out}/s"),
-        Human("viscous_difference", 2 * float(p[3]) / g, "{in} s/{out}"),
+        Human("viscous_difference", 2 * viscous / g, "{in} s/{out}"),
     )
 
 

@@ -115,3 +115,29 @@ def test_the_extra_falls_by_one_of_three_laws(flag: float, falls: Callable[[floa
         sign = -1.0 if v < 0.0 else 1.0
         expected = 1.0 + sign * 0.2 + 0.5 * falls(abs(v) / 0.1)
         assert friction_limit(v, sign, row, 0) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("step_rad", [0.05, 0.2])
+def test_a_mass_on_a_spring_loses_the_same_travel_with_every_half_turn(step_rad: float) -> None:
+    """Closed form: a half turn about +-F/k each, until the spring cannot overcome the friction F where it turns."""
+    width = 0.06  # F/k
+    t = np.arange(int(35.0 / step_rad)) * step_rad
+    half = np.floor(t / np.pi)
+    way = np.where(half % 2 == 0, 1.0, -1.0)
+    exact = way * width + (1.0 - width - 2.0 * width * half) * np.cos(t)
+    rest = half >= 8.0  # 1 - 16 F/k is the first turn within F/k
+    exact[rest] = 1.0 - 16.0 * width
+    cos, sin = np.cos(step_rad), np.sin(step_rad)
+    held = np.array([1.0 - cos, sin])
+    body = Body(
+        np.array([[cos, sin], [-sin, cos]]), held, np.zeros(2), np.array([1.0, 0.0]), np.array([0.0, 1.0]), True, 1,
+        step_rad, True,
+    )  # fmt: skip
+    friction = np.zeros(FRICTION)
+    friction[0] = width
+    rows = Rows(friction, NO_SPRING, NONE5, np.zeros(0), np.zeros(0))
+    x = run_feedback(
+        body, rows, np.zeros(t.size), np.array([[1.0, 0.0]]), np.zeros(1, np.int64), np.array([t.size])
+    )  # fmt: skip
+    assert np.max(np.abs(x[:, 0] - exact)) < 0.1 * step_rad**2
+    assert np.ptp(x[rest, 0][2:]) == 0.0

@@ -36,6 +36,8 @@ def test_base_equations_are_type(tex: str):
         (r"\sigma_i\,x,\; r_i \ll 1", "σᵢ x,  rᵢ ≪ 1"),
         (r"\Delta\,\mathrm{round}(x/\Delta)", "Δ round(x/Δ)"),
         (r"\dot h = \dots - a \sqrt{h_i - e}", "h\u0307 = … - a √(hᵢ - e)"),
+        (r"J\ddot\varphi = M", "Jφ\u0308 = M"),
+        (r"p_0 (1 \pm a (s - \bar s))", "p₀ (1 ± a (s - s\u0304))"),
         (r"\sqrt{g} \sum_{d \ge 2} c \quad\text{or}\quad 1", "√g Σ_(d≥2) c   or   1"),
     ],
 )

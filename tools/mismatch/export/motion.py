@@ -88,6 +88,18 @@ def _memory(found: ForceCode, plant: PlantCode, step: str) -> tuple[list[str], l
         lines.append(f"stiff, bristle = {found.stiff}, 0.0")
     if found.limit:
         lines += ["", "def limit(v, sign):", f"    return max({found.limit}, 0.0)"]
+    if found.limit and not found.stiff:
+        lines += [
+            "",
+            "def speed_after(v, free, gain):  # dry friction: a body that turns within a step rests, or slips back",
+            "    sign = 1.0 if v > 0 or (v == 0 and free > 0) else -1.0",
+            "    slipped = free - sign * limit(v, sign) * gain",
+            "    if slipped * sign >= 0:",
+            "        return slipped",
+            "    sign = 1.0 if free > v else -1.0",
+            "    over = abs(free - v) - limit(0.0, sign) * gain",
+            "    return sign * over * slipped / (slipped - v) if over > 0 else 0.0",
+        ]
     if found.stiff:
         lines += ["", *bend_code(found.lean, "def bend(z, v):", step)]
     if found.smooth:
@@ -119,9 +131,8 @@ def _step(found: ForceCode, straight: bool, substeps: int) -> list[str]:
         body.append("bristle = bend(bristle, 0.5 * speed @ (s + z))")
     elif found.limit:
         body += [
-            "v, push = speed @ z, speed @ (g0 + g1)",
-            "most = limit(speed @ s, 1.0 if v > 0 else -1.0)  # dry friction takes no more than stops the motion",
-            "z = z - (g0 + g1) * (np.sign(v) * most if abs(v) > most * push else v / push)",
+            "v, gain = speed @ z, speed @ (g0 + g1)",
+            "z = z + (g0 + g1) * (speed_after(speed @ s, v, gain) - v) / gain",
         ]
     return [*body, "s = z"]
 

@@ -8,8 +8,9 @@ _WORDS = {
     "tau": "τ", "omega": "ω", "alpha": "α", "lambda": "λ", "epsilon": "ε", "varphi": "φ", "theta": "θ", "pi": "π",
     "delta": "δ", "Delta": "Δ", "ell": "ℓ", "sum": "Σ", "times": "×", "cdot": "·", "ge": "≥", "le": "≤", "ne": "≠",
     "ll": "≪", "sigma": "σ", "sim": "~", "ln": "ln", "sin": "sin", "cos": "cos", "sgn": "sgn", "left": "", "right": "",
+    "pm": "±",
 }  # fmt: skip
-_ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "tilde": "\u0303"}
+_ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "tilde": "\u0303", "bar": "\u0304"}
 _SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _SUBSCRIPT = str.maketrans("0123456789ijkhd", "₀₁₂₃₄₅₆₇₈₉ᵢⱼₖₕ\0")
 
@@ -24,7 +25,7 @@ def plain(tex: str) -> str:
     text = re.sub(r"\\dots(?![A-Za-z])", "…", text)  # before the accents, which would read it as a dotted s
     text = re.sub(r"\\sqrt\s*\{([^{}]*)\}", r"√(\1)", re.sub(r"\\sqrt\s*\{(\w)\}", r"√\1", text))
     for accent, mark in _ACCENTS.items():
-        text = re.sub(rf"\\{accent}\s*(\\?[A-Za-z])", lambda m, k=mark: _name(m[1]) + k, text)
+        text = re.sub(rf"\\{accent}\s*(\\[A-Za-z]+|[A-Za-z])", lambda m, k=mark: _name(m[1]) + k, text)
     text = re.sub(r"\\([A-Za-z]+)", lambda m: _WORDS.get(m[1], m[1]), text)
     text = re.sub(r"_\{([^{}]*)\}", lambda m: _low(m[1]), text)
     text = re.sub(r"_(.)", lambda m: _low(m[1]), text)

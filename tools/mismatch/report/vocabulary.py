@@ -13,6 +13,7 @@ from rich.text import Text
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context, Effect
+from tools.mismatch.engine.unexplained import about
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.wording import words
 from tools.terminal import pairs_of
@@ -41,7 +42,7 @@ _ACTS = {
     "add": "adds to the signal",
     "linear": "filters the signal",
     "nonlinear": "maps the signal",
-    "feedback": "a force in the equation of motion",
+    "feedback": "a force or flow inside the equations",
 }
 
 
@@ -62,7 +63,7 @@ def _entry(effect: Effect) -> Entry:
         effect.source,
         effect.excitation,
         effect.confusable_with,
-        effect.needs,
+        about(effect),
         effect.twins,
     )
 
@@ -117,7 +118,7 @@ def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
         rows.append(("where", f"{', '.join(e.stages)}; {e.acts}"))
         rows.append(("shown by", e.excitation))
         if e.needs:
-            rows.append(("needs", f"recorded {', '.join(e.needs)}"))
+            rows.append(("needs", f"recorded {' or '.join(e.needs)}"))
         if e.twins:
             rows.append(("only in", ", ".join(e.twins)))
         if e.confusable_with:

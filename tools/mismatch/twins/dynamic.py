@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human
-from sim_devices.physics.forces import UNCENTRED
+from sim_devices.physics.forces import OFFSET, UNCENTRED
 from tools.mismatch.twins.base import Balance, Counted, Force, Run, Signal, central_difference, midway, travelled
 from tools.mismatch.twins.feedback import Body, Rows, pack
 from tools.mismatch.twins.forced import ForcedRun
@@ -101,7 +101,17 @@ class DynamicTwin(Head):
 
     def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
         """See Twin."""
-        return {UNCENTRED: (1.0,)} if self.counted == "start" else {}
+        uncentred = {UNCENTRED: (1.0,)} if self.counted == "start" else {}
+        return {**uncentred, **({OFFSET: (1.0,)} if self._has_offset else {})}
+
+    @property
+    def _has_offset(self) -> bool:
+        """Return True if a constant force is a parameter of the twin, or moves the zeros of its outputs alone."""
+        if self.kind == "mechanical_axis":
+            return True
+        size = np.abs(np.linalg.eigvals(self.plant_of(self.begin).a))
+        discrete = self.holds.get(self.inputs[0]) == "discrete"
+        return not discrete and bool(np.min(size, initial=np.inf) > 1e-9 * np.max(size, initial=0.0))
 
     def sensitivity(self, output: str, theta: Array) -> float:
         """See Twin: this is the gain that weights of input and feedback effects carry."""

@@ -90,14 +90,31 @@ class Body(NamedTuple):
 
 
 @kernel
+def speed_after(v, free, gain, friction):
+    """Return the speed after a step from speed ``v`` that would end at ``free`` without dry friction.
+
+    ``gain``: change of the speed per unit of a force. Friction acts against the speed at the begin of the step. Where
+    the body turns within it, it rests while all else changes its speed by less than friction can, or the rest of the
+    step is slip the other way (Karnopp, J. Dyn. Syst. Meas. Control 107, 1985, 100, without his band).
+    """
+    sign = 1.0 if v > 0.0 or (v == 0.0 and free > 0.0) else -1.0
+    slipped = free - sign * max(friction_limit(v, sign, friction, 0), 0.0) * gain
+    if slipped * sign >= 0.0:
+        return slipped
+    push = free - v
+    sign = 1.0 if push > 0.0 else -1.0
+    over = abs(push) - max(friction_limit(0.0, sign, friction, 0), 0.0) * gain
+    return sign * over * slipped / (slipped - v) if over > 0.0 else 0.0
+
+
+@kernel
 def run_feedback(body, rows, u, x0, starts, stop):
     """Return states (n, s) of a ``Body`` with forces (``Rows``) added to the input u (n,), from x0 (starts, s).
 
     The linear part is exact over a step. Smooth forces and memory vary linearly over
-    the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it reduces the
-    velocity by as much as its limit allows and at most to rest (time stepping; Acary, Brogliato, Numerical Methods for
-    Nonsmooth Dynamical Systems, 2008, section 1.4). With bristles (``friction[5]`` > 0) it is the LuGre model, its
-    state exact at the mean speed of a step. ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
+    the step, predicted and corrected once (second order). Dry friction is set-valued (``speed_after``). With bristles
+    (``friction[5]`` > 0) it is the LuGre model, its state exact at the mean speed of a step. ``stop`` (starts,) ends
+    each stretch early (the rest keeps the last state).
     """
     ad, g0, g1, cp, cv, held, sub, step_s, dry = body
     friction, spring, cogging, thresholds, memory, _ = rows
@@ -192,12 +209,9 @@ def run_feedback(body, rows, u, x0, starts, stop):
                     vn = 0.0
                     for i in range(s):
                         vn += cv[i] * z[i]
-                    sign = 1.0 if vn > 0.0 else -1.0
-                    limit = max(friction_limit(v, sign, friction, 0), 0.0)
-                    if limit > 0.0:
-                        f = -sign * limit if abs(vn) > limit * gv else -vn / gv
-                        for i in range(s):
-                            z[i] += (g0[i] + g1[i]) * f
+                    f = (speed_after(v, vn, gv, friction) - vn) / gv
+                    for i in range(s):
+                        z[i] += (g0[i] + g1[i]) * f
                 for i in range(s):
                     x[i] = z[i]
         for i in range(s):

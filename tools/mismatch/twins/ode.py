@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
-from sim_devices.physics.forces import FLOW, UNCENTRED
+from sim_devices.physics.forces import FLOW, OFFSET, UNCENTRED
 from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
@@ -99,7 +99,10 @@ class OdeTwin(Head):
 
     def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
         """See Twin."""
-        return {UNCENTRED: (1.0,)} if self._is_free else {}
+        if self._is_free:
+            return {UNCENTRED: (1.0,)}
+        free = {self.names[i] for i in self.free}
+        return {OFFSET: (1.0,)} if self.equations.affine and {f"{o}_offset" for o in self.outputs} <= free else {}
 
     @cached_property
     def _is_free(self) -> bool:

@@ -264,9 +264,12 @@ def page() -> str:
         "",
         "`micron mismatch physics` prints formulas, parameters, sources and what shows each.",
         "",
-        "| name | physics | acts |",
-        "|---|---|---|",
-        *(f"| `{e.name}` | {_cell(e.summary)} | {_cell(e.acts)} |" for e in entries()),
+        "| name | physics | acts | only in | needs a recorded |",
+        "|---|---|---|---|---|",
+        *(
+            f"| `{e.name}` | {_cell(e.summary)} | {_cell(e.acts)} | {_code(e.twins)} | {' or '.join(e.needs)} |"
+            for e in entries()
+        ),
         "",
     ]
     return "\n".join(lines)
