@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.cli.main import app
 from tools.errors import RecordingError
@@ -223,7 +224,8 @@ def test_the_page_says_what_a_stranger_asks() -> None:
     for signal, needed in {"temperature": "temperature_sensitivity", "current": "current_coupling"}.items():
         assert f"| `{signal}` | {CONTEXT_UNITS[signal][0]} | `{needed}` |" in text
     assert f"{recording_load.MIN_SAMPLES} samples are needed" in text
-    assert "`[twin.units]`" in text
+    assert "`units` may stand there or, as here, in `[twin]`" in text.replace("\n", " ")
+    assert all(f"| `{name}` |" in text for name in EFFECTS)
 
 
 def test_the_command_that_lists_effects_is_named_where_a_stranger_looks() -> None:

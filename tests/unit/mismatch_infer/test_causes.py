@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -9,9 +11,12 @@ from scipy.signal import cont2discrete, lfilter
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array
 from tests.unit.mismatch_engine.cases import recording, swung
+from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.pose import prepared
-from tools.mismatch.infer import causes, diagnose
+from tools.mismatch.infer import causes, decide, diagnose
 from tools.mismatch.infer.causes import caused_by
+from tools.mismatch.infer.decide import followed_by
+from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 
 RATE_HZ = 200.0
@@ -39,6 +44,30 @@ def test_what_an_input_does_by_a_path_of_its_own_is_no_noise_and_ringing_noise_i
     report = diagnose(rec, jobs=1, effects=[EFFECTS[n] for n in ("dead_time", "first_order_lag")])
     assert report.physics == ()
     assert (report.verdict == "unexplained") is carried
+
+
+def ringing() -> Recording:
+    """A body beside noise that rings as it does."""
+    rng = np.random.default_rng(8)
+    u, _, noise = rng.standard_normal((3, 6000))
+    y, left = swung(u, RATE_HZ), swung(noise, RATE_HZ, 75.0, 1.0)
+    left *= 0.3 * np.std(y) / np.std(left)
+    y = y + left + 0.02 * np.std(left) * rng.standard_normal(u.size)
+    return recording("state_space", {"u": u}, {"x": y}, {**BODY, "B": [[0.0], [1.0]]}, rate_hz=RATE_HZ)
+
+
+@pytest.mark.parametrize("p_value", [1e-9, 1e-4])
+def test_a_rest_is_no_noise_whose_walk_follows_a_signal(p_value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    walk, base = SimpleNamespace(key=1), SimpleNamespace(key=0)
+    placed = Placed(EFFECTS["random_walk"], "output", "x", "environment", ("x",))
+    follows = {1: (placed, Dependence("u", "value", p_value, 0.3, False))}
+    ranked = SimpleNamespace(every_ranked=lambda: [walk, base], base=base, dependent=lambda s: follows.get(s.key))
+    found = followed_by(ranked)  # type: ignore[arg-type]
+    monkeypatch.setattr(decide, "followed_by", lambda _: found)
+    report = diagnose(ringing(), jobs=1, effects=[EFFECTS[n] for n in ("dead_time", "first_order_lag")])
+    assert report.verdict == ("unexplained" if p_value < 1e-6 else "agrees")
+    if p_value < 1e-6:
+        assert report.location.depends_on[0].signal == "u"
 
 
 def regulated(rng: np.random.Generator) -> tuple[Array, Array]:

@@ -124,11 +124,11 @@ LEAST_LEAD = 0.1
 """Least share of a residual that a free curve must explain to be a rival of effects."""
 
 
-def led_by(problem: Problem, fitted: Fit, output: str, course: Array, *, p_limit: float = 1e-3) -> str:
-    """Return the signal that the ``course`` (m,) of an output follows, and "" if there is none."""
+def led_by(problem: Problem, fitted: Fit, output: str, course: Array, *, p_limit: float = 1e-3) -> Dependence | None:
+    """Return the signal that the ``course`` (m,) of an output follows; None if there is none."""
     e, features = tested_features(problem, replace(fitted, residual={**fitted.residual, output: course}), output)
     found = follows_course(e, [f for f in features if f.kind != "time itself"])
-    return next((d.signal for d in found if d.p_value < p_limit and d.strength > LEAST_LEAD), "")
+    return next((d for d in found if d.p_value < p_limit and d.strength > LEAST_LEAD), None)
 
 
 def block_means(x: Array, dt: float, problem: Problem) -> Array:

@@ -57,9 +57,10 @@ def borne_out(
         if s.key == left[0].key:
             break
         if (found := store.dependent(s)) is not None:
-            effect, signal = found
+            effect, followed = found
             withheld.setdefault(
-                effect.effect.name, entry_of(store, s, Doubt(s.placed.index(effect), "follows_signal", (signal,)))
+                effect.effect.name,
+                entry_of(store, s, Doubt(s.placed.index(effect), "follows_signal", (followed.signal,))),
             )
     return left, tuple(w for name, w in withheld.items() if name not in left[0].names)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.noise import floor_interval
@@ -20,7 +21,7 @@ from tools.mismatch.infer.borne_out import Out, borne_out, doubts_of, entry_of
 from tools.mismatch.infer.causes import caused_by
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted
-from tools.mismatch.infer.loudness import louder_with
+from tools.mismatch.infer.loudness import LEAST_P, louder_with
 from tools.mismatch.infer.store import Scored, Store, part_of
 
 MARGIN = 1.05
@@ -419,10 +420,12 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
         if is_whole(*worst_left(p, store.base.fitted, coloured, doubt=False), c):
             loudest = tuple(o for o, (_, hi) in coloured.floors.items() if hi > rest.floors[o][1])
             moved = ((o, louder_with(p, coloured.fit, o) or caused_by(p, coloured.fit, o)) for o in loudest)
-            known = {o: d for o, d in moved if d is not None}
+            known = {**followed_by(store), **{o: d for o, d in moved if d is not None}}
+            known = {o: d for o, d in known.items() if o in loudest}
             if not known:
                 return Judged(final, coloured, True, loudest, False)
-            # noise is neither louder where the simulation moves more, nor predicted by the past of what moves
+            # noise is not louder where the simulation moves more, the past of what moves does not predict it, and the
+            # walk or drift that fits it follows nothing
             left = {
                 o: replace(v, follows=(known[o], *v.follows), real=True) if o in known else v
                 for o, v in rest.left.items()
@@ -432,6 +435,18 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
     whole = strange is None and (loud if final.placed else quiet)
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
     return Judged(final, rest, whole, doubtful, whole and quiet and most_left[0] <= c.cut)
+
+
+def followed_by(store: Store) -> dict[str, Dependence]:
+    """Return per output what an effect that depends on no signal follows, in sets that score better than the base."""
+    out: dict[str, Dependence] = {}
+    for s in store.every_ranked():
+        if s.key == store.base.key:
+            break
+        found = store.dependent(s)
+        if found is not None and found[1].p_value < LEAST_P:
+            out |= {o: found[1] for o in found[0].outputs if o not in out}
+    return out
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:

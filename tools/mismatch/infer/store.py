@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from hal.arrays import Array
 from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import uncertainty
@@ -93,7 +94,7 @@ class Store:
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
         self._ahead: dict[tuple[Key, str], float] = {}
-        self._dependent: dict[Key, tuple[Placed, str] | None] = {}
+        self._dependent: dict[Key, tuple[Placed, Dependence] | None] = {}
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
         self.outputs = float(len(problem.twin.outputs))
@@ -181,8 +182,8 @@ class Store:
                 first.append(s)
         return first
 
-    def dependent(self, s: Scored) -> tuple[Placed, str] | None:
-        """Return an effect of ``s`` that depends on no signal by its definition, and the signal that it follows.
+    def dependent(self, s: Scored) -> tuple[Placed, Dependence] | None:
+        """Return an effect of ``s`` that depends on no signal by its definition, and how it follows one.
 
         A course by a cause of its own follows no signal. What does stands for physics that is missing.
         """
@@ -191,15 +192,15 @@ class Store:
                 self._dependent[s.key] = next(self._follow(s), None)
         return self._dependent[s.key]
 
-    def _follow(self, s: Scored) -> Iterator[tuple[Placed, str]]:
+    def _follow(self, s: Scored) -> Iterator[tuple[Placed, Dependence]]:
         for k, placed in enumerate(s.placed):
             # what passes the dynamics of a plant follows its motion
             if placed.site != "output" or not placed.effect.is_independent or placed.effect.claims is not None:
                 continue
             for o in placed.outputs:
                 course = undone(self.problem, s.fitted, o, [k])
-                if np.all(np.isfinite(course)) and (signal := led_by(self.problem, s.fitted, o, course)):
-                    yield placed, signal
+                if np.all(np.isfinite(course)) and (found := led_by(self.problem, s.fitted, o, course)) is not None:
+                    yield placed, found
 
     def every_ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
         """Return the proper sets as ``ranked`` does, with those in which an independent effect follows a signal."""

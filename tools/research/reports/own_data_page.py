@@ -54,7 +54,7 @@ for k in range(t.size):
         friction = 2.0 if abs(net) > 2.0 or abs(v) > 1e-4 else abs(net)
         before, v = v, v + (net - friction * np.sign(v if abs(v) > 1e-4 else net)) / 2.0 / 200 / 50
         v = 0.0 if before * v < 0 and abs(net) < 2.0 else v
-        x += v / 200 / 50
+        x += (before + v) / 2 / 200 / 50
 table = np.array(rows)
 table[:, 2] += np.random.default_rng(1).normal(0, 0.02, t.size)
 np.savetxt("data.csv", table, delimiter=",", header="t_s,force_N,x_mm", comments="")
