@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numba
@@ -11,6 +12,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array
 from tests.unit.mismatch_engine.cases import recording
+from tools.mismatch.engine.pose import Ended
 from tools.mismatch.infer import diagnose, run
 
 RATE_HZ, SLIDING_N = 500.0, 0.6
@@ -59,3 +61,19 @@ def test_the_interval_of_a_level_holds_the_law_that_was_not_named(monkeypatch: p
     narrow = level(monkeypatch, alone=True)
     assert low <= SLIDING_N <= high
     assert high - low > narrow[1] - narrow[0]
+
+
+def test_of_two_forms_the_one_is_reported_that_leaves_less_in_the_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def scored(form: str, left: float) -> SimpleNamespace:
+        placed = SimpleNamespace(effect=SimpleNamespace(name="coulomb_friction"), site="feedback", target="x")
+        return SimpleNamespace(key=form, placed=(placed,), fitted=SimpleNamespace(form=form, left=left))
+
+    short, whole, doubted = scored("bristles", 3.0), scored("plain", 2.0), scored("smooth", 1.0)
+    store = SimpleNamespace(base=SimpleNamespace(fitted=None), sets={s.key: s for s in (short, whole, doubted)})
+    posed = SimpleNamespace(problem=None)
+    monkeypatch.setattr(run, "run_through", lambda _, base, fitted, held: Ended(base, fitted, left=fitted.left))
+    monkeypatch.setattr(run, "doubts_of", lambda _, fitted: [1] if fitted.form == "smooth" else [])
+    chosen, ended = run.best_form(posed, store, short, 0.3)  # type: ignore[arg-type]
+    assert (chosen, ended.fitted) == (whole, whole.fitted)
+    monkeypatch.setattr(run, "run_through", lambda _, base, fitted, held: Ended(base, fitted))
+    assert run.best_form(posed, store, short, 0.3)[0] is short  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.screen import Candidate
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
-from tools.mismatch.engine.trust import broken, stayed
+from tools.mismatch.engine.trust import broken, fit_loss, stayed
 from tools.mismatch.input_noise import error_of_mean
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
@@ -199,13 +199,15 @@ class Ended:
     """Holds a search whose fits run through the whole record.
 
     ``official`` has the held-out part in one free run if the decisions were made on shorter stretches. ``forms`` has
-    other forms of the same effects that fit as well.
+    other forms of the same effects that fit as well. ``left``: mean square of ``fitted`` in noise variances, on the
+    fitted samples of the whole run; None where the decisions were made on it.
     """
 
     base: Fit
     fitted: Fit
     official: Problem | None = None
     forms: tuple[Fit, ...] = ()
+    left: float | None = None
 
 
 def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> Ended:
@@ -217,7 +219,8 @@ def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> 
     whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
     course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
     base, fitted = (over_the_whole(problem, course, f, posed.raw) for f in (base, fitted))
-    return Ended(base, fitted, None if problem.split.own else course)
+    left = fit_loss(course, residuals(course, Model(through, fitted.model.placed), fitted.theta))
+    return Ended(base, fitted, None if problem.split.own else course, left=left)
 
 
 def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Recording:

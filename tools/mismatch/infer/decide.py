@@ -226,19 +226,24 @@ FORMS = 3
 """Number of other forms of the named effects whose parameters widen the intervals."""
 
 
+def other_forms(store: Store, chosen: Scored) -> list[Scored]:
+    """Return the sets that have other forms of the effects of ``chosen``, at the same places."""
+    where = sorted((e.effect.name, e.site, e.target) for e in chosen.placed)
+    return [
+        s
+        for s in store.sets.values()
+        if s.key != chosen.key and sorted((e.effect.name, e.site, e.target) for e in s.placed) == where
+    ]
+
+
 def forms_as_good(store: Store, chosen: Scored) -> tuple[Fit, ...]:
     """Return the fits of other forms of the effects of ``chosen`` at their places that fit as well, best first.
 
     A form that would not be named itself, because a size that it needs may be zero, is none of them.
     """
-    where = sorted((e.effect.name, e.site, e.target) for e in chosen.placed)
-    alike = [
-        s
-        for s in store.sets.values()
-        if s.key != chosen.key and sorted((e.effect.name, e.site, e.target) for e in s.placed) == where
-    ]
+    alike = other_forms(store, chosen)
     alike += [store.with_law(chosen, k, law) for k, e in enumerate(chosen.placed) for law in e.effect.other_laws]
-    if not where or not alike:
+    if not chosen.placed or not alike:
         return ()
     margins, own = _margins(store, chosen), {part_of(e) for e in chosen.placed}
     good: list[Scored] = []
