@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.forces import COGGING, FRICTION, SPRING, friction_limit, loop_along
+from sim_devices.physics.forces import COGGING, FRICTION, OFFSET, SPRING, friction_limit, loop_along
 from sim_devices.physics.hysteresis import dahl
 from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 
@@ -141,3 +141,27 @@ def test_a_mass_on_a_spring_loses_the_same_travel_with_every_half_turn(step_rad:
     )  # fmt: skip
     assert np.max(np.abs(x[:, 0] - exact)) < 0.1 * step_rad**2
     assert np.ptp(x[rest, 0][2:]) == 0.0
+
+
+def test_a_level_that_differs_with_the_direction_is_one_level_beside_a_constant_force() -> None:
+    """In motion and at rest, so that a twin with such a force has no second parameter for it."""
+    coulomb = EFFECTS["coulomb_friction"]
+    sided, plain = {"speed": (1.0,)}, {"speed": (1.0,), OFFSET: (1.0,)}
+    names = [[w.name for w in coulomb.parts(s).weights] for s in (sided, plain)]
+    assert names == [["level", "asymmetry", "viscous_asymmetry"], ["level", "viscous_asymmetry"]]
+    assert coulomb.fill is not None
+    dt, asymmetry = 0.01, 0.2
+    t = np.arange(1500) * dt
+    u = 1.2 * np.sin(0.7 * t) + 0.6 * np.sin(2.3 * t)
+    body = Body(
+        np.array([[1.0, dt], [0.0, 1.0]]), np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2]),
+        np.array([1.0, 0.0]), np.array([0.0, 1.0]), False, 1, dt, True,
+    )  # fmt: skip
+    runs = []
+    for weights, settings, force in (((0.5, asymmetry, 0.0), sided, u), ((0.5, 0.0), plain, u - asymmetry)):
+        row = coulomb.fill(np.zeros(0), np.array(weights), settings)["friction"]
+        rows = Rows(row, NO_SPRING, NONE5, np.zeros(0), np.zeros(0))
+        end = np.array([t.size])
+        runs.append(run_feedback(body, rows, force, np.zeros((1, 2)), np.zeros(1, np.int64), end))
+    assert np.any(runs[0][1:, 1] == 0.0)  # it rests at times
+    assert np.max(np.abs(runs[0] - runs[1])) < 1e-9 * np.ptp(runs[0])
