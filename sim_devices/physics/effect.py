@@ -247,10 +247,10 @@ class Effect:
     sites: tuple[Site, ...] = ("input", "output")
     needs: tuple[str, ...] = ()
     shared: bool = False
-    acts_on: tuple[Literal["motion", "storage", "storages", "parameter", "direction", "joint"], ...] = ("motion",)
+    acts_on: tuple[Literal["motion", "storage", "storages", "parameter", "state", "direction", "joint"], ...] = ("motion",)
     """Where a feedback effect acts: at a velocity, between two of them (a joint), at any other state (a level, a
-    current, a temperature), at all such states at once, on a parameter of differential equations, or on one and the
-    direction of a state."""
+    current, a temperature), at all such states at once, on a parameter of differential equations that follows a signal
+    or a state, or on one and the direction of a state."""
     end_units: tuple[str, ...] = ()
     """Units that the signal at an input or output must have for the effect to sit there; empty: any."""
     position_units: tuple[str, ...] = ()

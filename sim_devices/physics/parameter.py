@@ -1,4 +1,4 @@
-"""Parameters of differential equations that are no constants: they follow a recorded signal, or a direction."""
+"""Parameters of differential equations that are no constants: they follow a signal, a state, or a direction."""
 
 from __future__ import annotations
 
@@ -28,21 +28,70 @@ def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     )
 
 
+def _fill(q: Array, w: Array, settings: Settings) -> Mapping[str, Array]:
+    return {"sway": np.array([*settings[PAIRS], w[0], settings["centre"][0], 0.0, 0.0])}
+
+
+BY_LOG = 3.0
+"""Marks a law for the logarithm of a parameter."""
+
+
+def _state_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    return {**_settings(x, residual, ctx), "range": (float(np.min(x[k])), float(np.max(x[k])))}
+
+
+def _state_parts(settings: Settings) -> Parts:
+    spread = settings.get("spread", (1.0,))[0]
+    square = Parameter("per_square", "1/{out}^2", scale=0.1 / spread**2)
+    return Parts((), (*_parts(settings).weights, square))
+
+
+def _state_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    ends = [v - settings["centre"][0] for v in settings["range"]]
+    low, high = (float(np.expm1(p[0] * d + p[1] * d**2)) for d in ends)
+    return (
+        Human("relative_change", float(p[0]), "1/{out}"),
+        Human("relative_curvature", float(p[1]), "1/{out}^2"),
+        Human("change_at_lowest", low, "1"),
+        Human("change_at_highest", high, "1"),
+    )
+
+
+BY_STATE = Effect(
+    name="parameter_variation",
+    summary="a parameter of the equations follows a state (an inductance its current)",
+    kind="feedback",
+    stages=("mechanics", "actuator", "environment"),
+    parts=_state_parts,
+    equation=r"p = p_0 \exp(a (x - \bar x) + b (x - \bar x)^2)",
+    source="second order of Taylor's series of ln p, which is the same law for 1/p; to first order of a temperature the"
+    " Frank-Kamenetskii form of Arrhenius' law (1955, ch. VI)",
+    excitation="high and low levels of the state while the input keeps moving",
+    confusable_with=("quadratic_drag", "cubic_stiffness", "nonlinear_heat_loss", "linear_loss"),
+    prepare=_state_settings,
+    basis=lambda x, ctx, q, settings: (x - settings["centre"][0])[:, None] ** np.array([1.0, 2.0]),
+    fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], settings["centre"][0], BY_LOG, w[1]])},
+    report=_state_report,
+    acts_on=("state",),
+)
+
 PARAMETER_VARIATION = Effect(
     name="parameter_variation",
-    summary="a parameter of the equations follows a recorded signal (a resistance its temperature)",
+    summary="a parameter of the equations follows a recorded signal or a state (a resistance its temperature)",
     kind="feedback",
     stages=("mechanics", "actuator", "environment"),
     parts=_parts,
     equation=r"p = p_0 (1 + a (s - \bar s))",
     source="IEC 60751:2022, section 5.2, to first order (platinum resistance); the same form for any other parameter",
-    excitation="a signal that changes while the input keeps moving",
+    excitation="a signal or state that changes while the input keeps moving",
     confusable_with=("thermal_drift", "temperature_sensitivity"),
     prepare=_settings,
     basis=lambda x, ctx, q, settings: (x - settings["centre"][0])[:, None],
-    fill=lambda q, w, settings: {"sway": np.array([*settings[PAIRS], w[0], settings["centre"][0], 0.0])},
+    fill=_fill,
     report=_report,
     acts_on=("parameter",),
+    variants=(BY_STATE,),
 )
 
 
@@ -57,7 +106,7 @@ def _directions(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _turned(q: Array, w: Array, settings: Settings) -> Mapping[str, Array]:
     parameter, state, way = settings[PAIRS]
-    return {"sway": np.array([parameter, state, w[0], 0.0, way])}
+    return {"sway": np.array([parameter, state, w[0], 0.0, way, 0.0])}
 
 
 RATE_SIGN, OWN_SIGN = 1.0, 2.0

@@ -31,7 +31,7 @@ SHORT = 3.0
 
 
 def _set(names: str, gain: float, parameters: int = 2, z: float | None = 9.0, rest: float = 0.0) -> SetTraits:
-    return SetTraits(frozenset(names), (SHORT - gain,), parameters, z if names else None, rest, 1.0)
+    return SetTraits(frozenset(names), (SHORT - gain,), parameters, 0.0, z if names else None, rest, 1.0)
 
 
 def _cases(rng: np.random.Generator, count: int, form_error: float) -> list[Case]:

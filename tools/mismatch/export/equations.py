@@ -156,7 +156,7 @@ class EquationLines:
     def see(self, inner: Sequence[Inner]) -> list[str]:
         """Return the context signals that equations or parameters follow; the lines take these and the inputs."""
         first = 1 + len(self.twin.state_list)
-        self.following = [one for one in inner if one.place.kind == "parameter"]
+        self.following = [one for one in inner if one.place.kind in ("parameter", "state")]
         seen = {int(one.slot.placed.settings[PAIRS][1]) for one in self.following}
         for program in (self.programs.rates_program, self.programs.outputs):
             seen |= {int(r) for r in (*program.operations[:, 2:].flat, *program.results)}
@@ -169,12 +169,16 @@ class EquationLines:
         return {i: f"({n} * ({swayed[i]}))" if i in swayed else n for i, n in enumerate(every)}
 
     def _followed(self, names: Sequence[str]) -> dict[int, list[str]]:
-        """Return the factors of the parameters that follow a signal, by register; ``names`` of states and signals."""
+        """Return the factors of the parameters that follow a signal or a state, by register; ``names`` of states and signals."""
         out: dict[int, list[str]] = {}
         for one in self.following:
             parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])
             centre = numbers(one.slot.setting("centre"))
-            out.setdefault(parameter, []).append(f"1 + {one.slot.at('per_unit')} * ({names[signal - 1]} - {centre})")
+            over = f"({names[signal - 1]} - {centre})"
+            law = f"1 + {one.slot.at('per_unit')} * {over}"
+            if one.place.kind == "state":
+                law = f"np.exp({one.slot.at('per_unit')} * {over} + {one.slot.at('per_square')} * {over}**2)"
+            out.setdefault(parameter, []).append(law)
         return out
 
     def run(self) -> list[str]:

@@ -72,10 +72,10 @@ class PooledStore(Store):
     """
 
     def __init__(
-        self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = (), jobs: int = 1
+        self, problem: Problem, base: Fit, constants: Constants, effects: Sequence[Effect] = (), jobs: int = 1
     ) -> None:
         self.jobs = jobs
-        super().__init__(problem, base, constants, events)
+        super().__init__(problem, base, constants, effects)
 
     def scored(self, fitted: Fit) -> Scored:
         """Score a fit by its cross-validated residual, without storing it."""
@@ -113,7 +113,7 @@ def pool(found: Found, posed: Posed, jobs: int = 1) -> tuple[Found, Posed]:
     def again(fitted: Fit) -> Fit:
         return fit(problem, fitted.model, [fitted.theta], iterations=15)
 
-    out = PooledStore(problem, again(store.base.fitted), store.constants, store.events, jobs)
+    out = PooledStore(problem, again(store.base.fitted), store.constants, store.effects, jobs)
     out.seen = dict(store.seen)
     store.sets.clear()
     store.eventful.clear()

@@ -64,7 +64,7 @@ class Search:
     ) -> None:  # fmt: skip
         self.jobs, self.progress = jobs, progress
         self.effects = tuple(e for e in effects if e.claims is None)
-        self.store = Store(problem, base, constants, [e for e in effects if e.claims is not None])
+        self.store = Store(problem, base, constants, effects)
         self.ground = ground_of(problem, base)
         self.expanded: set[Key] = set()
         self.moves = moves

@@ -57,8 +57,9 @@ class Scored:
     """Holds a set with its joint fit.
 
     ``density`` is the mean log density of held-out samples per output, ``blocks`` (blocks, outputs) the same per
-    held-out block; ``parameters`` is the number of parameters of the effects. ``proper`` is True if the fit did not
-    diverge and every effect is within its physical range.
+    held-out block; ``parameters`` is the number of parameters of the effects. ``choices`` are the nats that
+    tell their places among all that they could have. ``proper`` is True if the fit did not diverge and every effect is
+    within its physical range.
     """
 
     key: Key
@@ -66,6 +67,7 @@ class Scored:
     density: dict[str, float]
     blocks: Array = field(repr=False)
     parameters: float
+    choices: float
     proper: bool
 
     @property
@@ -84,9 +86,11 @@ class Store:
     found beside it.
     """
 
-    def __init__(self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = ()) -> None:
+    def __init__(self, problem: Problem, base: Fit, constants: Constants, effects: Sequence[Effect] = ()) -> None:
         self.problem = problem
-        self.events = tuple(events)
+        self.effects = tuple(effects)
+        self.events = tuple(e for e in effects if e.claims is not None)
+        self._choices: dict[str, float] = {}
         self.constants = constants
         self.count = Count.of(constants, int(problem.held_rows.size), recordings_held(problem))
         self.sets: dict[Key, Scored] = {}
@@ -140,7 +144,18 @@ class Store:
         # values that a law is free to follow have the price of parameters, among the samples that count
         free = self.count.noise / self.outputs * sum(w.free for w in every.values())
         figures = free + sum(figures_of(e, fitted) for e in fitted.model.placed)
-        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
+        choices = sum(self.choices_of(name) for name in {e.effect.name for e in fitted.model.placed})
+        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, choices, proper)
+
+    def choices_of(self, name: str) -> float:
+        """Return the nats that tell the place of an effect among all that this problem has for it.
+
+        Of two descriptions that predict as well, the one that had fewer chances to do so is the more likely.
+        """
+        if name not in self._choices:
+            own = [e for e in self.effects if e.name == name]
+            self._choices[name] = float(np.log(max(len(places(self.problem, own, ())), 1)))
+        return self._choices[name]
 
     def lawful(self, predictable: float) -> bool:
         """Return True if the prediction errors of a noise effect are white enough.
@@ -150,14 +165,14 @@ class Store:
         return self.count.noise * predictable < self.constants.per_name
 
     def score(self, s: Scored) -> float:
-        """Return the score in nats: the tempered log density less the prices of names and parameters.
+        """Return the score in nats: the tempered log density less the prices of names, their places and parameters.
 
         The likelihood is raised to a power below one, because the form of a model is never exact (Miller and Dunson
         2019), and to a smaller one where form errors are most of the residual (``Count``). The loss is the mean over
         the outputs that have something to explain, because an error of form on one of them is repeated on all.
         """
         c = self.constants
-        prices = c.per_name * len(s.names) + c.per_parameter * s.parameters
+        prices = c.per_name * len(s.names) + s.choices + c.per_parameter * s.parameters
         return -self.lost(s) - prices if s.proper else -np.inf
 
     def lost(self, s: Scored) -> float:

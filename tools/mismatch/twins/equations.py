@@ -31,15 +31,15 @@ class Place:
     """
 
     name: str
-    kind: Literal["motion", "storage", "storages", "parameter", "direction", "joint"]
+    kind: Literal["motion", "storage", "storages", "parameter", "state", "direction", "joint"]
     position: int
     velocity: int
     target: int
     unit: str
     """Unit of the position, or of the stored quantity."""
     pairs: tuple[float, ...] = ()
-    """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of what it may follow: a signal, or the
-    direction of a state. Of a joint: position, velocity and target of its other side, the ratio b of x_1 - b x_2, and
+    """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of what it may follow: a signal, a
+    state, or the direction of a state. Of a joint: position, velocity and target of its other side, the ratio b of x_1 - b x_2, and
     the typical size and speed of that."""
 
 

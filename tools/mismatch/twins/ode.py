@@ -45,6 +45,8 @@ FORGOTTEN = 20.0  # least number of time constants in a record; a slower state i
 
 PUSHED = ("motion", "joint")
 """Kinds of places at which a force acts."""
+VARYING = ("parameter", "state", "direction")
+"""Kinds of places at which a parameter is no constant."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ class OdeTwin(Head):
 
     def force_gain(self, target: str, theta: Array) -> tuple[float, str]:
         """Return the gain from the input that drives a place to the derivative there, and that input ("": none)."""
-        if self.place(target).kind in ("parameter", "direction"):
+        if self.place(target).kind in VARYING:
             return 1.0, ""
         row = self.linearised(self.values(theta)).b[self.place(target).target]
         for i, s in enumerate(self.inputs):
@@ -178,7 +180,7 @@ class OdeTwin(Head):
         if place.kind == "parameter":
             signal = run.signals[self.signals[place.position]]
             return signal, np.gradient(signal, run.dt)
-        if place.kind == "direction":
+        if place.kind in ("state", "direction"):
             ((x, _),) = self._courses(run, theta, (place.position,))
             return x, np.gradient(x, run.dt)
         if place.kind == "joint":
@@ -297,7 +299,7 @@ class OdeTwin(Head):
         """Return the rows (k, SWAY) of the parameters that vary, in the order of their places."""
         by: dict[str, list[Array]] = {}
         for f in forces:
-            if f.effect.fill is not None and self.place(f.target).kind in ("parameter", "direction"):
+            if f.effect.fill is not None and self.place(f.target).kind in VARYING:
                 by.setdefault(f.target, []).append(f.effect.fill(f.q, f.weights, f.settings)["sway"])
         return np.array([row for rows in by.values() for row in rows], np.float64).reshape(-1, SWAY)
 

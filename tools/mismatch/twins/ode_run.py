@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, flow_of, friction_limit, smooth_force
-from sim_devices.physics.parameter import RATE_SIGN
+from sim_devices.physics.parameter import BY_LOG, OWN_SIGN, RATE_SIGN
 from tools.mismatch.twins.program import run_program
 
-SWAY = 5
+SWAY = 6
 """Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and in place
-of the value the sign of that state's derivative at the constant parameters (1) or of the state itself (2)."""
+of the value the sign of that state's derivative at the constant parameters (1) or of the state itself (2), or a law for
+its logarithm (3), and the strength of the square in that."""
+
+MOST_LOG = 50.0
+"""Largest logarithm of the factor of a parameter: a trial of the search must stay finite."""
 
 STEEP = 0.25
 """Fall of friction with speed, times a step, above which the step is taken in parts."""
@@ -58,9 +62,17 @@ class Packed(NamedTuple):
     memory: Array
     flows: Array
     sway: Array
-    """Parameters (k, 5) that follow a signal or a direction: p (1 + strength (value - centre)); see ``SWAY``."""
+    """Parameters (k, SWAY) that follow a signal, a state or a direction; see ``varied``."""
     joints: Array
     """Smooth forces (k, JOINT) between two bodies."""
+
+
+@kernel
+def varied(value, sway, c):
+    """Return the factor of a parameter at the ``value`` of what it follows: 1 + a d, d = value - centre, or of a state
+    exp(a d + b d^2)."""
+    d = value - sway[c, 3]
+    return np.exp(min(d * (sway[c, 2] + d * sway[c, 5]), MOST_LOG)) if sway[c, 4] == BY_LOG else 1.0 + d * sway[c, 2]
 
 
 @kernel
@@ -197,9 +209,11 @@ def run_equations(program, drive, packed, x0, limits):
                                 r = int(sway[c, 0])
                                 first[c] = registers[r]
                                 value = registers[int(sway[c, 1])]
-                                if sway[c, 4] != 0.0:
-                                    value = way[c] if sway[c, 4] == RATE_SIGN else np.sign(value)
-                                registers[r] *= 1.0 + sway[c, 2] * (value - sway[c, 3])
+                                if sway[c, 4] == RATE_SIGN:
+                                    value = way[c]
+                                elif sway[c, 4] == OWN_SIGN:
+                                    value = np.sign(value)
+                                registers[r] *= varied(value, sway, c)
                         run_program(operations, registers)
                         if last == 0:
                             for c in range(sway.shape[0]):
@@ -321,8 +335,8 @@ def run_readings(program, x, u, t, sway):
         for c in range(sway.shape[0]):
             registers[int(sway[c, 0])] = registers0[int(sway[c, 0])]
         for c in range(sway.shape[0]):
-            if sway[c, 4] == 0.0:
-                registers[int(sway[c, 0])] *= 1.0 + sway[c, 2] * (registers[int(sway[c, 1])] - sway[c, 3])
+            if sway[c, 4] == 0.0 or sway[c, 4] == BY_LOG:
+                registers[int(sway[c, 0])] *= varied(registers[int(sway[c, 1])], sway, c)
         run_program(operations, registers)
         for j in range(results.size):
             out[k, j] = registers[results[j]]

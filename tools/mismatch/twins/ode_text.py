@@ -125,6 +125,9 @@ def _assembled(
         for i, j, way in _directions(equations, places, x, u, values, changing):
             name = f"{names[i]} by {'sign' if way == OWN_SIGN else 'direction'} of {states[j].name}"
             places = (*places, Place(name, "direction", j, j, 0, states[j].unit, (float(first + i), 1.0 + j, way)))
+        for i, j in _state_pairs(equations, x, u, values, changing):
+            name = f"{names[i]} by {states[j].name}"
+            places = (*places, Place(name, "state", j, j, 0, states[j].unit, (float(first + i), 1.0 + j)))
     units_of = {**own_units, **{n: recording.unit[o] for n, o in offset_of.items()}}
 
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
@@ -283,6 +286,44 @@ def _parameters(
         if s in recording.context
         for i in free
     ]
+
+
+PAIRED, APART = 60, 1e-6
+"""Number of points of a run at which parameters that follow states are compared, and the least share of what one
+changes in the derivatives that neither the constant parameters nor another one changes as well."""
+
+
+def _state_pairs(
+    equations: Equations, x: Array, u: Array, values: Array, free: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Return (parameter, state): each parameter of a derivative, with a state that it may follow.
+
+    Left out is what changes the derivatives as constant parameters do (a resistance that follows the only current
+    beside a voltage), and of those that do the same all but the first.
+    """
+    at = np.linspace(0, x.shape[0] - 1, min(PAIRED, x.shape[0])).astype(int)
+    some, beside = x[at], u[at]
+    as_given = rates_at(equations, some, beside, values)
+    scale = np.maximum(np.max(np.abs(as_given), axis=0), 1e-300)
+    slopes: dict[int, Array] = {}
+    for i in free:
+        changed, step = values.copy(), 1e-4 * (abs(values[i]) or 1.0)
+        changed[i] += step
+        slope = (rates_at(equations, some, beside, changed) - as_given) / step / scale
+        if np.all(np.isfinite(slope)) and np.any(slope):
+            slopes[i] = slope / np.linalg.norm(slope)
+    known, out = [s.ravel() for s in slopes.values()], list[tuple[int, int]]()
+    for i, slope in slopes.items():
+        for j in range(x.shape[1]):
+            column = (slope * (some[:, j] - np.mean(some[:, j]))[:, None]).ravel()
+            size = np.linalg.norm(column)
+            if not size > 0.0:
+                continue
+            left = column - (basis := np.column_stack(known)) @ np.linalg.lstsq(basis, column)[0]
+            if np.linalg.norm(left) > APART * size:
+                out.append((i, j))
+                known.append(column / size)
+    return out
 
 
 def _directions(

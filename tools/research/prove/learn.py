@@ -58,6 +58,7 @@ class SetTraits:
     names: frozenset[str]
     short: tuple[float, ...]
     parameters: float
+    choices: float
     z: float | None
     rest: float | None
     explained: float | None
@@ -71,7 +72,7 @@ class SetTraits:
         """Return the score as ``Store.score`` does."""
         count = Count.of(c, held)
         lost = sum(count.lost(v) for v in self.short) / outputs
-        return -lost - c.per_name * len(self.names) - c.per_parameter * self.parameters
+        return -lost - c.per_name * len(self.names) - self.choices - c.per_parameter * self.parameters
 
 
 def traits_of(inferred: Inferred) -> dict[str, Any]:
@@ -94,7 +95,7 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         "outputs": store.outputs,
         "sets": [
             {"names": sorted(s.names), "short": [*store.short(s).values()], "parameters": s.parameters,
-             "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
+             "choices": s.choices, "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
             for s in [*kept[:SETS], *([] if store.base in kept[:SETS] else [store.base])]
         ],
         "strange": None if strange is None else {
@@ -122,7 +123,10 @@ def sets_of(traits: Traits) -> list[SetTraits]:
         rest, explained = left.get(names, (None, None))
         beside = events.get(names, {})
         out.append(
-            SetTraits(names, tuple(s["short"]), float(s["parameters"]), passed.get(names), rest, explained, beside)
+            SetTraits(
+                names, tuple(s["short"]), float(s["parameters"]), float(s["choices"]), passed.get(names), rest, explained,
+                beside,
+            )  # fmt: skip
         )
     return out
 
