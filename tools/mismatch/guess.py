@@ -28,6 +28,7 @@ from tools.mismatch.guess_roles import (
     assign,
     choose_kinds,
     simulated_courses,
+    split_clock,
     split_unit,
     word,
 )
@@ -130,7 +131,7 @@ def guess(path: Path, kind: str = "") -> Guess:
     """
     names = _names(path)
     file_units = column_units(path)
-    parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else split_unit(k) for k in names}
+    parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else _split(k) for k in names}
     words = words_in(path)
     notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
     unknown_units = {k: u for k, u in file_units.items() if u and not units.is_unit(u)}
@@ -171,7 +172,7 @@ def guess(path: Path, kind: str = "") -> Guess:
             if f"simulated_{o}" not in found.signals.values()
         ]
     if kind and not given and not any(word(parts[k][0]) == found.signals.get(k) for k in left):
-        assumed.append(f"the twin is a {kind}, by its units alone; for another repeat with --twin KIND")
+        assumed.append(f"the kind of twin is {kind}, by its units alone; for another repeat with --twin KIND")
     bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
     if bare:
         assumed.append("units: " + ", ".join(f"'{k}' in {_assumed_unit(kind, found, k) or '1'}" for k in bare))
@@ -271,6 +272,12 @@ def _slices(path: Path, names: list[str]) -> Iterator[dict[str, Array]]:
             yield {name: values[a : a + BLOCK_ROWS] for name, values in block.items()}
 
 
+def _split(name: str) -> tuple[str, str]:
+    """Return the name of a column without its unit, and the unit; ``t_min`` is in minutes, and ``x_min`` is not."""
+    clock = split_clock(name)
+    return clock if _TIME.match(clock[0]) else split_unit(name)
+
+
 def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> tuple[str, str]:
     """Find the column of time and the assumption behind the choice; both are empty without one."""
     for name in names:
@@ -280,7 +287,7 @@ def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> t
             continue
         forward = _forward(head[name])
         if (_TIME.match(plain) and forward > 0.5) or (seconds and forward > 0.9):
-            return name, "" if unit or plain.lower().startswith("sec") else f"the time in '{name}' is in s"
+            return name, "" if unit else f"the time in '{name}' is in s"
     first = names[0]
     if _UNNAMED.match(first) and _forward(head[first]) == 1.0:
         steps = np.diff(head[first])

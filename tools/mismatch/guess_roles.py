@@ -19,10 +19,12 @@ _SUFFIX = re.compile(
 )
 _QUOTIENT = re.compile(r"^(?P<name>.+?)_(?P<over>[^\W\d_]+)_(?P<under>s2?|m2)$")
 """A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``."""
+_SPOKEN = {"mps": "m/s", "mps2": "m/s^2", "radps": "rad/s", "radps2": "rad/s^2"}
+"""Units as names of columns spell them."""
 _ORDINARY_WORDS = ("in", "ft", "min", "h", "l", "L", "F", "H")
 """Units that are also words or letters (``x_in``, ``x_min``, ``wheel_l``). They count as units in brackets only."""
 _WORDS: tuple[tuple[GuessedRole, str], ...] = (
-    ("context", r"temp|supply|ambient|humid|status|flag|state"),
+    ("context", r"temp|supply|\brail|ambient|humid|status|flag|state"),
     ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
     ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|kraft"),
 )
@@ -65,6 +67,7 @@ def split_unit(name: str) -> tuple[str, str]:
         return name.strip(), ""
     unit = (found["inside"] or found["after"]).strip()
     plain = found["name"].strip().rstrip(",").strip()
+    unit = _SPOKEN.get(unit, unit)
     if unit in ("C", "F") and "temp" in plain.lower():
         unit = f"deg{unit}"
     if unit and not units.is_unit(unit):
@@ -72,6 +75,23 @@ def split_unit(name: str) -> tuple[str, str]:
     if not found["inside"] and (unit.isdigit() or unit in _ORDINARY_WORDS):
         return name.strip(), ""
     return plain, unit
+
+
+_TIME_UNITS = {"s": r"s|secs?|seconds?", "min": r"min|mins|minutes?", "h": r"h|hrs?|hours?", "ms": r"ms|msecs?"}
+_TIME_SUFFIX = re.compile(
+    r"^(?P<name>t|time|.*[ _-])??[ _-]?(?:" + "|".join(f"(?P<{u}>{p})" for u, p in _TIME_UNITS.items()) + r")$", re.I
+)
+
+
+def split_clock(name: str) -> tuple[str, str]:
+    """Return the name of a column of time without its unit, and the unit: of time, ``h`` and ``min`` are no words.
+
+    The unit is empty where the name ends in none.
+    """
+    plain, unit = split_unit(name)
+    if unit or (found := _TIME_SUFFIX.match(name.strip())) is None:
+        return plain, unit
+    return (found["name"] or "time").rstrip(" _-"), next(u for u in _TIME_UNITS if found[u])
 
 
 def role_of_name(name: str) -> GuessedRole:
@@ -116,12 +136,13 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
     hints: dict[str, GuessedRole] = {name: role_of_name(parts[name][0]) for name in names}
     for name in names:  # the twin's own words
         found.take_if(name, hints[name], lambda own, _, pattern, __: re.fullmatch(pattern, own) is not None)
-    for name in names:  # a unit of the twin
-        found.take_if(
-            name,
-            hints[name],
-            lambda _, unit, __, known: unit != "" and any(units.same_dimension(unit, u) for u in known),
-        )
+    for of in (hints, dict.fromkeys(names, "")):  # a unit of the twin; u_x_V may be what an accelerometer answers
+        for name in names:
+            found.take_if(
+                name,
+                of[name] if hints[name] != "context" else "context",
+                lambda _, unit, __, known: unit != "" and any(units.same_dimension(unit, u) for u in known),
+            )
     named = len(found.roles)
     assumed: list[str] = []
     if by_order:
@@ -140,7 +161,7 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
         if name in found.roles or name in dropped:
             continue
         plain, unit = parts[name]
-        rival = found.rival(unit) if unit else ""
+        rival = found.rival(unit) if unit and hints[name] != "context" else ""
         if rival:
             found.roles[name] = ""
             notes.append(f"column '{name}' is not used: '{rival}' is the {found.signals[rival]} already")

@@ -9,7 +9,7 @@ import numpy as np
 
 from tools.errors import RecordingError
 from tools.mismatch import units
-from tools.mismatch.guess_roles import split_unit
+from tools.mismatch.guess_roles import split_clock
 from tools.mismatch.recording import Array
 
 LONGEST_GAP = 20.0  # longest gap that is filled, in usual steps of a time column
@@ -20,7 +20,7 @@ CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch wi
 def in_seconds(column: str, stamps: Array, unit_in_file: str = "", notes: list[str] | None = None) -> Array:
     """Return the time stamps (n,) in s: converted, with a note, where the column's name or the file states another unit
     of time."""
-    unit = unit_in_file if units.is_unit(unit_in_file) else split_unit(column)[1]
+    unit = unit_in_file if units.is_unit(unit_in_file) else split_clock(column)[1]
     if not unit or not units.same_dimension(unit, "s") or units.parse(unit).factor == 1.0:
         return stamps
     if notes is not None:

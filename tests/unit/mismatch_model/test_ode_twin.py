@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from hal.trust import trust_program
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Settings
 from tests.unit.mismatch_model.ode_systems import CHANNELS, MOTOR, RATE_HZ, command, pendulum, recorded
 from tools.errors import RecordingError
 from tools.mismatch.engine.reach import not_tried
@@ -20,6 +21,7 @@ from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import starts
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.ode import OdeTwin
 
 
 def test_a_free_run_is_the_solution(tmp_path: Path) -> None:
@@ -148,31 +150,66 @@ unit   = "rad"
         make(recorded(tmp_path / "bad", '[twin]\nkind = "columns"\n', u, u**2))
 
 
-def test_a_parameter_may_follow_a_recorded_signal(tmp_path: Path) -> None:
-    """The effect does what the same law written into the equations does."""
-    channels = CHANNELS + '\n[[channels]]\ncolumn = "T"\nrole = "context"\nsignal = "temperature"\nunit = "degC"\n'
+TEMPERATURE = '\n[[channels]]\ncolumn = "T"\nrole = "context"\nsignal = "temperature"\nunit = "degC"\n'
+
+
+@pytest.mark.parametrize(
+    ("law", "place", "settings", "weights"),
+    [
+        ("1 + 0.05 * (temperature - 25)", "tau by temperature", {"centre": (25.0,), "spread": (5.0,)}, [0.05]),
+        (
+            "exp(0.02 * (speed - 0.5) - 0.001 * (speed - 0.5)**2)",
+            "tau by speed",
+            {"centre": (0.5,), "spread": (1.0,), "range": (-1.0, 1.0)},
+            [0.02, -0.001],
+        ),
+    ],
+)
+def test_a_parameter_may_follow_a_signal_or_a_state(
+    tmp_path: Path, law: str, place: str, settings: Settings, weights: list[float]
+) -> None:
+    """The effect does what the same law written into the equations does; outputs that have the parameter follow."""
     u = command()
     warm = 20.0 + 15.0 * np.linspace(0.0, 1.0, u.size) ** 2
     np.savez(tmp_path / "data.npz", u=u, y=0.1 * u[::-1], T=warm)
     head = f'format = 1\ndata = "data.npz"\nrate_hz = {RATE_HZ}\n'
     found: list[np.ndarray] = []
-    for law in ("tau", "(tau * (1 + 0.05 * (temperature - 25)))"):
-        # outputs that have the parameter follow as well
-        read = f'[twin.outputs]\nangle = "angle + 0.1 * {law} * speed"\n'
-        (tmp_path / "recording.toml").write_text(head + MOTOR.replace("/ tau", f"/ {law}") + read + channels)
+    for tau in ("tau", f"(tau * ({law}))"):
+        read = f'[twin.outputs]\nangle = "angle + 0.1 * {tau} * speed"\n'
+        text = head + MOTOR.replace("/ tau", f"/ {tau}") + read + CHANNELS + TEMPERATURE
+        (tmp_path / "recording.toml").write_text(text)
         recording = load(tmp_path)
         twin = make(recording)
-        places = [p.target for p in sites(twin, recording, EFFECTS["parameter_variation"])]
-        assert places == ["gain by temperature", "tau by temperature"]
-        found.append(Model(twin).simulate(View.whole(recording), np.array([20.0, 0.08, 0.0]))["angle"])
-        if law == "tau":
-            place = sites(twin, recording, EFFECTS["parameter_variation"])[1]
-            pairs = twin.place(place.target).pairs  # type: ignore[attr-defined]
-            model = Model(twin, [replace(place, settings={"centre": (25.0,), "spread": (5.0,), "pairs": pairs})])
-            found.append(model.simulate(View.whole(recording), np.array([20.0, 0.08, 0.0, 0.05]))["angle"])
+        assert isinstance(twin, OdeTwin)
+        theta = np.array([20.0, 0.08, 0.0])
+        found.append(Model(twin).simulate(View.whole(recording), theta)["angle"])
+        if tau == "tau":
+            here = {p.target: p for p in sites(twin, recording, EFFECTS["parameter_variation"])}
+            pairs = twin.place(place).pairs
+            model = Model(twin, [replace(here[place], settings={**settings, "pairs": pairs})])
+            found.append(model.simulate(View.whole(recording), np.array([*theta, *weights]))["angle"])
     plain, by_effect, written = found
     assert np.allclose(by_effect, written, rtol=0, atol=1e-12)
     assert np.std(plain - written) > 0.01
+
+
+def test_a_parameter_follows_no_state_where_constant_ones_do_the_same(tmp_path: Path) -> None:
+    """``a (1 + c T) - b T`` is another ``b``, and ``b`` and ``d`` stand for each other; a signal is followed anywhere."""
+    cooling = """
+[twin]
+kind = "ode"
+[twin.states]
+angle = "rad"
+[twin.equations]
+angle = "a + command - b * d * angle"
+[twin.parameters]
+a = 0.3
+b = 2.0
+d = 1.5
+"""
+    recording = recorded(tmp_path, cooling, command(), 0.1 * command())
+    targets = [p.target for p in sites(make(recording), recording, EFFECTS["parameter_variation"])]
+    assert targets == ["b by angle"]
 
 
 def test_the_zero_of_a_sensor_is_a_parameter_and_written(tmp_path: Path) -> None:

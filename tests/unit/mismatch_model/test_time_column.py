@@ -9,6 +9,7 @@ import pytest
 
 from tests.recording_text import stack_channels
 from tools.errors import RecordingError
+from tools.mismatch.guess import guess
 from tools.mismatch.recording_clock import on_grid
 from tools.mismatch.recording_load import load
 
@@ -41,6 +42,23 @@ def test_a_clock_that_wanders_keeps_every_sample_in_time(tmp_path: Path) -> None
     found = load(write(tmp_path, t))
     assert found.inputs["command"] == pytest.approx(np.sin(3 * found.t), abs=3 * 0.0052)
     assert any("no gaps" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "unit"),
+    [("t_h", 3600, "h"), ("t_min", 60, "min"), ("hours", 3600, "h"), ("x_min", 60, "min"), ("t_ms", 1e-3, "ms")],
+)
+def test_a_clock_in_hours_or_minutes_is_converted(tmp_path: Path, name: str, factor: float, unit: str) -> None:
+    t = np.arange(500) * 0.01
+    np.savez(tmp_path / "data.npz", **{name: t, "u": np.sin(3 * t), "z": np.cos(3 * t)})  # pyright: ignore[reportArgumentType]
+    text = TEXT.replace('"t_s"', f'"{name}"') + stack_channels("u", "z")
+    (tmp_path / "recording.toml").write_text(text)
+    found = load(tmp_path)
+    assert found.dt == pytest.approx(0.01 * factor)
+    assert any(f"'{name}' is in {unit}: converted to s" in w for w in found.warnings)
+    proposed = guess(tmp_path / "data.npz", "piezo_stack")
+    # of a column that nobody says is a clock, x_min is the least x
+    assert (proposed.clock, proposed.clock_unit) == (("", "s") if name == "x_min" else (name, unit))
 
 
 def test_a_long_gap_is_refused(tmp_path: Path) -> None:
@@ -77,12 +95,3 @@ def test_a_time_in_ms_under_a_bare_name_is_noticed(tmp_path: Path, kind: str, is
     notes = [note for note in load(tmp_path).warnings if "if the column is in ms" in note.lower()]
     assert len(notes) == is_in_ms
     assert all("rate_hz = 100 in place of time_column" in note for note in notes)
-
-
-def test_a_time_column_that_names_its_unit_is_converted(tmp_path: Path) -> None:
-    t_s = np.arange(600) * 0.01
-    np.savez(tmp_path / "data.npz", t_ms=1e3 * t_s, u=np.sin(3 * t_s), z=np.cos(3 * t_s))
-    (tmp_path / "recording.toml").write_text(TEXT.replace('"t_s"', '"t_ms"') + stack_channels("u", "z"))
-    found = load(tmp_path)
-    assert found.dt == pytest.approx(0.01)
-    assert "time column 't_ms' is in ms: converted to s" in found.warnings

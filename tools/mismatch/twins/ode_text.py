@@ -94,7 +94,7 @@ def _assembled(
     held = np.array([holds.get(s) == "zero" for s in signals])
     fixed = table.get("fixed", [])
     if not isinstance(fixed, Sequence) or isinstance(fixed, str) or any(f not in names for f in fixed):
-        raise RecordingError(f"{where} fixed must list parameters that stay as given, got {fixed!r}")
+        raise RecordingError(f"{where} fixed must list parameters that stay as given ({', '.join(names)}), got {fixed!r}")
     own_units = table.get("units", {})
     if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
         raise RecordingError(f"{where} units must give the unit of each parameter as text")
@@ -467,7 +467,9 @@ def _programs(
 
 def _texts(key: str, table: object) -> dict[str, str]:
     if not isinstance(table, Mapping):
-        raise EquationError(f"{key} must be a table of equations")
+        raise EquationError(
+            f"{key} must be a table: the line [twin.{key}], and below it NAME = \"an equation as text\" each"
+        )
     out: dict[str, str] = {}
     for name, text in table.items():
         if not isinstance(text, str | int | float) or isinstance(text, bool):

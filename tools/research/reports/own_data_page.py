@@ -82,7 +82,8 @@ micron mismatch simulate twin.py . --out simulated.csv
 The command reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
 {endings}.
 It prints what it could not know and writes it into the file as a comment. `--twin KIND` names the twin. A column `t`
-without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no column is a time. `t_ms` is read as ms.
+without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no column is a time. `t_ms`, `t_min` and
+`t_h` are read as they say.
 
 Where time steps are uneven or values are missing, the command names the line and writes nothing. Repeat it with
 `--cut`: it resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
@@ -121,7 +122,7 @@ kind = "ode"
 [twin.states]
 speed = "rad/s"          # or { unit = "rad/s", start = 0.0 }, where the search for its start begins
 
-[twin.equations]         # the derivative of each state
+[twin.equations]         # the derivative of each state, per second
 speed = "(torque_per_A * current - bearing * speed) / inertia"
 
 [twin.parameters]        # re-fitted, but for those in fixed
