@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,16 @@ def test_an_effect_that_is_not_there_is_not_named_though_a_search_took_it(name: 
     assert [w.name for w in withheld] == [name]
     assert withheld[0].reason in ("holds_zero", "at_limit")
     assert withheld[0].shown_by
+
+
+def test_a_set_pays_for_the_choice_of_its_places() -> None:
+    """A dead zone at the input or at the output of one axis has two places, a spring that hardens one."""
+    problem, _, base = prepared(stage(3), 0.3, 0, False)
+    effects = [EFFECTS["dead_zone"], EFFECTS["quadratic_drag"]]
+    store = Store(problem, base, learned(), effects)
+    with np.errstate(all="ignore"):
+        sets = [store.with_one(store.base, places(problem, [e], ())[0]) for e in effects]
+    assert [s.choices for s in sets] == pytest.approx([math.log(2.0), 0.0])
 
 
 def test_friction_that_is_there_stays() -> None:

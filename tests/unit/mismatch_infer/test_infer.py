@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -54,15 +55,18 @@ class _Store:
 class _Set:
     """The part of a scored set that its score reads."""
 
-    def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0) -> None:
+    def __init__(
+        self, density: float, names: set[str], parameters: int, idle: int = 0, choices: float = 0.0
+    ) -> None:
         self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
-        self.names, self.parameters, self.proper = frozenset(names), parameters, True
+        self.names, self.parameters, self.choices, self.proper = frozenset(names), parameters, choices, True
 
 
 def test_a_name_and_a_parameter_have_their_price() -> None:
     c = replace(START, per_name=5.0, per_parameter=0.5)
     store = _Store(Count(200.0, 50.0), c)
     assert store.score(_Set(0.1, {"a"}, 3)) == pytest.approx(200 * 0.1 - 5 - 1.5)
+    assert store.score(_Set(0.1, {"a"}, 3, choices=2.0)) == pytest.approx(200 * 0.1 - 5 - 2 - 1.5)
     assert store.score(_Set(0.1, {"a", "b"}, 3)) == pytest.approx(200 * 0.1 - 10 - 1.5)
     assert store.score(_Set(-0.2, set(), 0)) == pytest.approx(-store.count.lost(0.2))
     assert _Store(Count(200.0, 50.0), c, 4).score(_Set(-0.2, set(), 0, idle=3)) == pytest.approx(
@@ -105,19 +109,35 @@ def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:
     assert math.isfinite(log_odds(0.0))
 
 
-def test_a_name_that_may_be_one_too_many_is_told_from_one_of_two_equals() -> None:
+Sets = list[tuple[frozenset[str], float]]
+
+
+def too_many(sets: Sets, known: bool, alone: Mapping[str, float] | None = None) -> frozenset[str]:
+    """Those of a and b that may be one too many; ``alone``: the scores of a and b without the other."""
+    scores = {**dict(sets), **{frozenset(n): v for n, v in (alone or {}).items()}}
     c = replace(START, sure_open=2.0)
+    return dispensable(frozenset("ab"), sets, known, c, lambda kept: scores.get(kept, -math.inf))
+
+
+def test_a_name_that_may_be_one_too_many_is_told_from_one_of_two_equals() -> None:
     extra = [(frozenset("ab"), 0.0), (frozenset("a"), -0.2), (frozenset("b"), -30.0), (frozenset(), -60.0)]
     equals = [(frozenset("ab"), 0.0), (frozenset("ac"), -0.2), (frozenset("a"), -30.0)]
-    assert dispensable(frozenset("ab"), extra, False, c) == {"b"}
-    assert dispensable(frozenset("ab"), equals, False, c) == set()
-    assert dispensable(frozenset("ab"), extra, True, c) == {"b"}
-    assert dispensable(frozenset("ab"), [(of, v - 4.0 * (of != frozenset("ab"))) for of, v in extra], True, c) == set()
+    assert too_many(extra, False) == {"b"}
+    assert too_many(equals, False) == set()
+    assert too_many(extra, True) == {"b"}
+    assert too_many([(of, v - 4.0 * (of != frozenset("ab"))) for of, v in extra], True) == set()
     either = [(frozenset("ab"), 0.0), (frozenset("a"), -0.2), (frozenset("b"), -0.3), (frozenset(), -60.0)]
-    assert dispensable(frozenset("ab"), either, False, c) == {"b"}
+    assert too_many(either, False) == {"b"}
     # two others in the place of one say as well that the rest is too few
     two = [(frozenset("ab"), 0.0), (frozenset("acd"), -0.2), (frozenset("a"), -30.0), (frozenset(), -60.0)]
-    assert dispensable(frozenset("ab"), two, True, c) == set()
+    assert too_many(two, True) == set()
+
+
+def test_of_two_that_one_other_replaces_the_one_goes_that_costs_less() -> None:
+    """Friction and a loop beside it, in whose place another law of friction may be: friction stays."""
+    one = [(frozenset("ab"), 0.0), (frozenset("c"), -2.0), (frozenset(), -900.0)]
+    assert too_many(one, True, {"a": -20.0, "b": -500.0}) == {"b"}
+    assert too_many(one, True, {"a": -500.0, "b": -20.0}) == {"a"}
 
 
 def test_the_form_of_what_is_named_may_leave_its_share() -> None:

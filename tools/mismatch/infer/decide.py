@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -136,10 +136,11 @@ def is_likely(p: float, known: bool, c: Constants) -> bool:
 
 
 def dispensable(
-    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], known: bool, c: Constants
-) -> frozenset[str]:
-    """Return those of ``names`` that may well be one too many, the weakest first: of two that stand for each other one
-    is needed.
+    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], known: bool, c: Constants,
+    score_of: Callable[[frozenset[str]], float],
+) -> frozenset[str]:  # fmt: skip
+    """Return those of ``names`` that may well be one too many, first the one without which the others score best: of
+    two that stand for each other one is needed. ``score_of`` returns the score of a smaller set.
 
     A name has the support of the sets that have it, or others in its place: which of two equals it is, is a question
     of its own (``Answer.rivals``).
@@ -150,11 +151,8 @@ def dispensable(
         rest = kept - {name}
         return sum(w for of, w in weights if name in of or rest < of)
 
-    while kept:
-        weakest = min(sorted(kept), key=support)
-        if is_likely(support(weakest), known, c):
-            break
-        kept -= {weakest}
+    while doubted := [name for name in sorted(kept) if not is_likely(support(name), known, c)]:
+        kept -= {max(doubted, key=lambda name: (score_of(kept - {name}), -support(name)))}
     return names - kept
 
 
@@ -352,7 +350,10 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     judged = judge(store, chosen, strange)
     sets = [(s.names, store.score(s)) for s in good]
     c, events = store.constants, store.eventful[chosen.key][1]
-    unlikely = dispensable(chosen.names, sets, judged.known, c)
+    unlikely = dispensable(
+        chosen.names, sets, judged.known, c,
+        lambda kept: store.score(store.without(chosen, lambda e: e.effect.name not in kept)),
+    )  # fmt: skip
     unlikely |= {name for name, p in events.items() if not is_likely(1.0 - p, judged.known, c)}
     if unlikely:
         final = judged.final

@@ -290,7 +290,10 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
         sets = [(s.names, case.score(s, c)) for s in case.accepted(c)]
         sure = surenesses(chosen.names, sets, known, c)
         sure |= {n: stated(1.0 - chosen.events[n], known, c) for n in chosen.with_events(c) - chosen.names}
-        withheld = dispensable(chosen.names, sets, known, c) if known else frozenset[str]()
+        scores = {s.names: case.score(s, c) for s in reversed(case.ranked(c))}
+        withheld = frozenset[str]()
+        if known:
+            withheld = dispensable(chosen.names, sets, known, c, lambda kept, of=scores: of.get(kept, -np.inf))
         for name, p in sure.items():
             if name in withheld:
                 continue
