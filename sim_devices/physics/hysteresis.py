@@ -503,7 +503,6 @@ HYSTERESIS = Effect(
     basis=_basis,
     report=_report,
     variants=(_FORCE,),
-    curve_weights=lambda settings: CURVES if _form(settings) == "stops_curved" else 0,
     vanishes_with=(("loop_width_share",),),
     plain="backlash",
 )

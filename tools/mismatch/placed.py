@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect, Parameter, Parts, Settings, Stage
 
@@ -32,10 +34,17 @@ class Placed:
         """Return the parameters of the effect."""
         return self.effect.parts(self.settings)
 
-    @property
-    def curve_weights(self) -> int:
-        """Return the number of the last weights, which are a curve without memory beside the effect."""
-        return self.effect.curve_weights(self.settings) if self.effect.curve_weights is not None else 0
+    @cached_property
+    def showing(self) -> NDArray[np.bool_]:
+        """Return True for the weights (k,) that alone make a size without which the effect is absent.
+
+        A curve without memory or a constant that stands beside the effect does not.
+        """
+        count = len(self.parts.weights)
+        if self.effect.report is None or self.parts.nonlinear:
+            return np.ones(count, np.bool_)
+        sizes = (self.effect.report(alone, self.settings, 1.0) for alone in np.eye(count))
+        return np.array([any(h.value for h in of if self.effect.shows_absence(h.name)) for of in sizes], np.bool_)
 
     @property
     def label(self) -> str:

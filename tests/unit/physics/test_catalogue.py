@@ -9,7 +9,9 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import STAGES, Context, Effect
+from sim_devices.physics.forces import UNCENTRED
 from tests.unit.vocabulary import NAMES
+from tools.mismatch.placed import Placed
 
 ALL = [(e.name + "/" + e.kind, e) for one in EFFECTS.values() for e in (one, *one.variants)]
 
@@ -38,8 +40,8 @@ def test_an_effect_is_described(effect: Effect) -> None:
     assert (effect.fill is not None) == (effect.kind == "feedback")
 
 
-@pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])
-def test_prepare_guess_and_forward_agree(effect: Effect) -> None:
+def screened(**facts: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, Context]:
+    """Return a signal (n,), a residual (n,) and what an effect may know of them."""
     rng = np.random.default_rng(0)
     n, dt = 1500, 0.004
     t = np.arange(n) * dt
@@ -51,9 +53,28 @@ def test_prepare_guess_and_forward_agree(effect: Effect) -> None:
     signals = {s: move(i) for i, s in enumerate([*names, "temperature", "supply", "actuator_current"])}
     x = signals["specific_force_x"]
     y = 2 * x + 0.02 * rng.standard_normal(n) + 0.3 * (t > 3)
-    facts = {"axis": (0.0,), "position_m": (0.1, 0.2, -0.1)}
-    ctx = Context(t, dt, signals, "accel_1x", "accel_1x", "specific_force_x", facts=facts, measured=y)
-    residual = y - 1.9 * x
+    known = {"axis": (0.0,), "position_m": (0.1, 0.2, -0.1), **facts}
+    ctx = Context(t, dt, signals, "accel_1x", "accel_1x", "specific_force_x", facts=known, measured=y)
+    return x, y - 1.9 * x, ctx
+
+
+def test_a_weight_that_alone_is_no_size_of_the_effect_does_not_show_it() -> None:
+    """The constant beside a loss and the linear term of a spring without a known rest prove neither."""
+    found: dict[str, list[str]] = {}
+    for name in ("linear_loss", "linear_stiffness", "cubic_stiffness", "gravity_load"):
+        effect = EFFECTS[name]
+        placed = Placed(effect, "feedback", "x", "mechanics", ("x",), effect.prepare(*screened(**{UNCENTRED: (1.0,)})))
+        found[name] = [w.name for w, shows in zip(placed.parts.weights, placed.showing, strict=True) if shows]
+    assert found == {
+        "linear_loss": ["loss"], "linear_stiffness": ["linear"], "cubic_stiffness": ["cubic", "quadratic"],
+        "gravity_load": ["sine", "cosine"],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])
+def test_prepare_guess_and_forward_agree(effect: Effect) -> None:
+    x, residual, ctx = screened()
+    n = x.size
     settings = effect.prepare(x, residual, ctx)
     assert all(isinstance(v, float) for values in settings.values() for v in values), "settings are plain numbers"
     parts = effect.parts(settings)
