@@ -90,7 +90,7 @@ _UNEVEN_SLEW = Effect(
     name="slew_limit",
     summary="rate of change limited",
     kind="nonlinear",
-    stages=("amplifier", "actuator"),
+    stages=("amplifier", "actuator", "sensor"),
     parts=_slew_parts,
     equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r_-,\, r_+\right)",
     source="W. Jung, Op Amp Applications Handbook, section 1-4",

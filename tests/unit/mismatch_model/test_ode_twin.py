@@ -144,6 +144,8 @@ unit   = "rad"
     assert np.allclose(residual, 0.02 * u + 0.1)
     assert "kind 'ode'" in not_tried(twin)
     assert not sites(twin, recording, EFFECTS["coulomb_friction"])
+    for name in ("backlash", "slew_limit", "dead_zone", "saturation", "resonance"):
+        assert sites(twin, recording, EFFECTS[name]), f"{name} may be between simulated columns and recorded ones"
     assert {p.site for p in sites(twin, recording, EFFECTS["backlash"])} == {"output"}
     assert not_tried(make(recorded(tmp_path / "motor", MOTOR, u, u**2))) == ""
     with pytest.raises(RecordingError, match="simulated_angle"):
