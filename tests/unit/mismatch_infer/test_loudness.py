@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, swung
+from tools.mismatch.engine.assemble import if_noise
 from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.verdict import Decision
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer.loudness import louder_with, rank_correlation
 
@@ -51,3 +55,8 @@ def test_a_stiffness_that_sways_is_no_noise_and_slow_noise_is(sways: bool) -> No
         assert {d.feature for d in report.location.depends_on} == {"amplitude"}
     else:
         assert report.verdict in ("agrees", "recalibrate")
+        # the line that people read first says what such a verdict rests on
+        rests = Decision("agrees", 1.0, "", (), {"x": (0.2, 0.9)}, ("x",))
+        said = " That holds if all of the 0.9 V that are left of x are noise; the spectrum vouches for 0.2."
+        assert if_noise(rests, problem, {"x": 0.9}) == said
+        assert if_noise(replace(rests, doubtful=()), problem, {"x": 0.9}) == ""

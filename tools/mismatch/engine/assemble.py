@@ -289,9 +289,9 @@ def summary(
     if verdict == "agrees":
         if problem.recording.tolerance and all(within_tolerance(problem, base).values()):
             return "The recording is within the declared tolerance of the simulation as given."
-        return "The recording is within its noise of the simulation as given."
+        return "The recording is within its noise of the simulation as given." + if_noise(decision, problem, b)
     if verdict == "recalibrate":
-        return "New base parameters explain the recording; no physics is missing."
+        return "New base parameters explain the recording; no physics is missing." + if_noise(decision, problem, b)
     if verdict == "missing_physics":
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
@@ -317,6 +317,18 @@ def summary(
     if decision.meaning == "fit_failed":
         return f"Something is left in {outputs}{what}, but the fit failed: {decision.trouble[0]}."
     return f"Something is left in {outputs} that no known effect explains{what}."
+
+
+def if_noise(decision: Decision, problem: Problem, left: Mapping[str, float]) -> str:
+    """Return the condition of a verdict without physics where it rests on the upper end of a noise floor; else ""."""
+    if not decision.doubtful:
+        return ""
+    o = max(decision.doubtful, key=lambda o: left[o] / max(decision.floors[o][0], 1e-300))
+    factor, unit = scaled(left[o], problem.twin.units[o], problem.recording.file_unit[o])
+    return (
+        f" That holds if all of the {number(factor * left[o])} {unit} that are left of {o} are noise; the spectrum"
+        f" vouches for {number(factor * decision.floors[o][0])}."
+    )
 
 
 MUCH_LEFT = 2.0
