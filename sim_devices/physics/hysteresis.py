@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from sim_devices.physics.curve import curve_basis
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import runs, signed_least_squares, thin, without_diverged
+from sim_devices.physics.statistics import runs, signed_least_squares, thin
 
 N_PLAYS = 10
 N_FINE = 20
@@ -312,7 +312,7 @@ def left_out(
     wide = slips_once(lo, hi, first if before is None else before)
     bent = loop_of(x, residual, ctx, lo, hi, wide=wide, before=before) if form == "stops_curved" else None
     e = columns(x, form, lo, hi, first, ctx.starts, wide_too=wide, before=before, bent=bent).T
-    a = without_diverged(np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)]))
+    a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
 
     def left(sign: float) -> float:
         total = 0.0

@@ -118,18 +118,11 @@ def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array
     return w / size, float(r @ r)
 
 
-def without_diverged(columns: Array) -> Array:
-    """Return columns (n, k) with zeros in place of those whose sum of squares is not finite."""
-    return np.where(np.isfinite(np.sum(columns * columns, axis=0)), columns, 0.0)
-
-
 def signed_least_squares(columns: Array, y: Array, signs: Array, ridge: float = 1e-10) -> Array:
     """Return the least-squares coefficients whose signs are ``signs`` (k,) or which are zero; 0 leaves one free.
 
-    A column whose squares overflow (a response that diverges) has the coefficient zero. C. L. Lawson, R. J. Hanson,
-    Solving Least Squares Problems (1974), chapter 23.
+    C. L. Lawson, R. J. Hanson, Solving Least Squares Problems (1974), chapter 23.
     """
-    columns = without_diverged(columns)
     size = np.sqrt(np.sum(columns * columns, axis=0))
     size[size == 0] = 1.0
     q = columns / size

@@ -239,11 +239,31 @@ def bends(model: Model, view: View, theta: Array, output: str) -> Array | None:
     return np.column_stack(columns) if np.all(np.isfinite(columns)) else None
 
 
+OVERFLOW = 1e100
+"""Size of a number above which a simulation or a response has diverged: its square must stay finite."""
+
+
+def _finite(x: Array) -> Array:
+    """Return ``x`` with zero where it diverged."""
+    return np.where(np.abs(x) < OVERFLOW, x, 0.0)
+
+
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
     """Return the signal (n,) on which a placed effect would act in ``model``, or that would drive it, and its context.
 
-    The context has the view as mask, the declared noise, and the path to the output.
+    The context has the view as mask, the declared noise, and the path to the output. Where a simulation or a response
+    has diverged, outside of what is scored, they are zero.
     """
+    x, ctx = _probe(model, view, theta, pl, output)
+    through = ctx.through
+    believed = None if ctx.believed is None else _finite(ctx.believed)
+    if through is not None:
+        ctx = replace(ctx, through=lambda change: _finite(through(change)))
+    signals = {s: _finite(v) if s == "velocity" else v for s, v in ctx.signals.items()}
+    return _finite(x), replace(ctx, believed=believed, signals=signals)
+
+
+def _probe(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
     twin = model.twin
     run = view_run(twin, view)
     ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)

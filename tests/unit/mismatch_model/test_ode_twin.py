@@ -18,7 +18,7 @@ from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
-from tools.mismatch.simulate_start import starts
+from tools.mismatch.simulate_start import prepare, starts
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.ode import OdeTwin
@@ -230,6 +230,19 @@ def test_the_zero_of_a_sensor_is_a_parameter_and_written(tmp_path: Path) -> None
     wrong = replace(recording, twin=replace(recording.twin, parameters={**text, "offsets": {"speed": 1.0}}))
     with pytest.raises(RecordingError, match=r"offsets must give a number for an output \(angle\), got"):
         make(wrong)
+
+
+@pytest.mark.parametrize("name", ["step_shift", "hysteresis", "resonance", "static_nonlinearity", "linear_loss"])
+def test_an_effect_can_be_prepared_beside_a_simulation_that_diverges(tmp_path: Path, name: str) -> None:
+    """A set of effects may run away where it is not scored; the search beside it goes on."""
+    recording = recorded(tmp_path, MOTOR, command(), 0.1 * command()[::-1])
+    model, view = Model(make(recording)), View.whole(recording)
+    away = np.array([20.0, -1e-3, 0.0])
+    with np.errstate(all="ignore"):
+        assert not np.all(np.isfinite(model.whole(view, away)["angle"]))
+        for place in sites(model.twin, recording, EFFECTS[name]):
+            placed = prepare(model, view, away, place)
+            assert all(np.all(np.isfinite(v)) for v in placed.settings.values())
 
 
 def test_a_parameter_that_has_the_name_of_an_offset_stays_the_engineers(tmp_path: Path) -> None:
