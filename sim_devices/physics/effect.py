@@ -171,6 +171,7 @@ class Parts:
     """Optional smoothness rows (rows, weights), in units of weight; the fit scales them by the noise."""
 
 
+Acting = Literal["motion", "storage", "storages", "parameter", "state", "direction", "joint"]
 Prepare = Callable[[Array, Array, Context], Settings]
 Apply = Callable[[Array, Context, Array, Settings], Array]
 Basis = Callable[[Array, Context, Array, Settings], Array]
@@ -248,7 +249,7 @@ class Effect:
     sites: tuple[Site, ...] = ("input", "output")
     needs: tuple[str, ...] = ()
     shared: bool = False
-    acts_on: tuple[Literal["motion", "storage", "storages", "parameter", "state", "direction", "joint"], ...] = ("motion",)
+    acts_on: tuple[Acting, ...] = ("motion",)
     """Where a feedback effect acts: at a velocity, between two of them (a joint), at any other state (a level, a
     current, a temperature), at all such states at once, on a parameter of differential equations that follows a signal
     or a state, or on one and the direction of a state."""

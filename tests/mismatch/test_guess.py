@@ -120,7 +120,9 @@ def test_a_twin_that_units_alone_suggest_is_an_assumption(tmp_path: Path):
 def test_a_supply_beside_an_accelerometer_is_context_and_its_axes_answer(tmp_path: Path):
     t = np.arange(200) / 100.0
     axes = [9.8 * np.sin(t), np.cos(t), np.sin(3 * t), 2.5 + 0.1 * np.sin(t), np.cos(t), np.sin(3 * t)]
-    found = guess(table(tmp_path, "t_s,g_x_mps2,g_y_mps2,g_z_mps2,u_x_V,u_y_V,u_z_V,rail_V", t, *axes, 5.0 + 0.01 * np.sin(9 * t)))
+    found = guess(
+        table(tmp_path, "t_s,g_x_mps2,g_y_mps2,g_z_mps2,u_x_V,u_y_V,u_z_V,rail_V", t, *axes, 5.0 + 0.01 * np.sin(9 * t))
+    )
     roles = {c.name: (c.role, c.signal) for c in found.columns}
     assert found.kind == "accelerometer"
     assert [roles[f"g_{a}_mps2"] for a in "xyz"] == [("input", f"specific_force_{a}") for a in "xyz"]

@@ -136,7 +136,8 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
     hints: dict[str, GuessedRole] = {name: role_of_name(parts[name][0]) for name in names}
     for name in names:  # the twin's own words
         found.take_if(name, hints[name], lambda own, _, pattern, __: re.fullmatch(pattern, own) is not None)
-    for of in (hints, dict.fromkeys(names, "")):  # a unit of the twin; u_x_V may be what an accelerometer answers
+    no_hints: dict[str, GuessedRole] = dict.fromkeys(names, "")
+    for of in (hints, no_hints):  # a unit of the twin; u_x_V may be what an accelerometer answers
         for name in names:
             found.take_if(
                 name,

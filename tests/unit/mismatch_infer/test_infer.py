@@ -55,9 +55,7 @@ class _Store:
 class _Set:
     """The part of a scored set that its score reads."""
 
-    def __init__(
-        self, density: float, names: set[str], parameters: int, idle: int = 0, choices: float = 0.0
-    ) -> None:
+    def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0, choices: float = 0.0) -> None:
         self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
         self.names, self.parameters, self.choices, self.proper = frozenset(names), parameters, choices, True
 

@@ -196,7 +196,7 @@ def test_a_parameter_may_follow_a_signal_or_a_state(
 
 
 def test_a_parameter_follows_no_state_where_constant_ones_do_the_same(tmp_path: Path) -> None:
-    """``a (1 + c T) - b T`` is another ``b``, and ``b`` and ``d`` stand for each other; a signal is followed anywhere."""
+    """``a (1 + c T) - b T`` is another ``b``, and ``b`` and ``d`` stand for each other."""
     cooling = """
 [twin]
 kind = "ode"

@@ -169,7 +169,7 @@ class EquationLines:
         return {i: f"({n} * ({swayed[i]}))" if i in swayed else n for i, n in enumerate(every)}
 
     def _followed(self, names: Sequence[str]) -> dict[int, list[str]]:
-        """Return the factors of the parameters that follow a signal or a state, by register; ``names`` of states and signals."""
+        """Return the factors of the parameters that follow one of ``names`` (states and signals), by register."""
         out: dict[int, list[str]] = {}
         for one in self.following:
             parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])

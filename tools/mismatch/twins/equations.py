@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.physics.effect import Array
+from sim_devices.physics.effect import Acting, Array
 from sim_devices.physics.forces import FLOW
 from tools.guest.equations import Program
 from tools.mismatch.twins.affine import is_affine
@@ -31,7 +31,7 @@ class Place:
     """
 
     name: str
-    kind: Literal["motion", "storage", "storages", "parameter", "state", "direction", "joint"]
+    kind: Acting
     position: int
     velocity: int
     target: int
@@ -39,8 +39,8 @@ class Place:
     """Unit of the position, or of the stored quantity."""
     pairs: tuple[float, ...] = ()
     """Pairs of a storage (``flows.PAIRS``), or the registers of a parameter and of what it may follow: a signal, a
-    state, or the direction of a state. Of a joint: position, velocity and target of its other side, the ratio b of x_1 - b x_2, and
-    the typical size and speed of that."""
+    state, or the direction of a state. Of a joint: position, velocity and target of its other side, the ratio b of
+    x_1 - b x_2, and the typical size and speed of that."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,9 @@ def _assembled(
     held = np.array([holds.get(s) == "zero" for s in signals])
     fixed = table.get("fixed", [])
     if not isinstance(fixed, Sequence) or isinstance(fixed, str) or any(f not in names for f in fixed):
-        raise RecordingError(f"{where} fixed must list parameters that stay as given ({', '.join(names)}), got {fixed!r}")
+        raise RecordingError(
+            f"{where} fixed must list parameters that stay as given ({', '.join(names)}), got {fixed!r}"
+        )
     own_units = table.get("units", {})
     if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
         raise RecordingError(f"{where} units must give the unit of each parameter as text")
@@ -293,9 +295,7 @@ PAIRED, APART = 60, 1e-6
 changes in the derivatives that neither the constant parameters nor another one changes as well."""
 
 
-def _state_pairs(
-    equations: Equations, x: Array, u: Array, values: Array, free: Sequence[int]
-) -> list[tuple[int, int]]:
+def _state_pairs(equations: Equations, x: Array, u: Array, values: Array, free: Sequence[int]) -> list[tuple[int, int]]:
     """Return (parameter, state): each parameter of a derivative, with a state that it may follow.
 
     Left out is what changes the derivatives as constant parameters do (a resistance that follows the only current
@@ -468,7 +468,7 @@ def _programs(
 def _texts(key: str, table: object) -> dict[str, str]:
     if not isinstance(table, Mapping):
         raise EquationError(
-            f"{key} must be a table: the line [twin.{key}], and below it NAME = \"an equation as text\" each"
+            f'{key} must be a table: the line [twin.{key}], and below it NAME = "an equation as text" each'
         )
     out: dict[str, str] = {}
     for name, text in table.items():

@@ -95,7 +95,8 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         "outputs": store.outputs,
         "sets": [
             {"names": sorted(s.names), "short": [*store.short(s).values()], "parameters": s.parameters,
-             "choices": s.choices, "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
+             "choices": s.choices, "tested": weakest.get(s.key), "left": leaves.get(s.key),
+             "events": events.get(s.key, {})}
             for s in [*kept[:SETS], *([] if store.base in kept[:SETS] else [store.base])]
         ],
         "strange": None if strange is None else {
@@ -124,9 +125,15 @@ def sets_of(traits: Traits) -> list[SetTraits]:
         beside = events.get(names, {})
         out.append(
             SetTraits(
-                names, tuple(s["short"]), float(s["parameters"]), float(s["choices"]), passed.get(names), rest, explained,
+                names,
+                tuple(s["short"]),
+                float(s["parameters"]),
+                float(s["choices"]),
+                passed.get(names),
+                rest,
+                explained,
                 beside,
-            )  # fmt: skip
+            )
         )
     return out
 

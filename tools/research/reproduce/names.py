@@ -13,6 +13,7 @@ MODULES: dict[str, str] = {
     "endoscope": "tools.research.reproduce.endoscope",
     "tremor": "tools.research.reproduce.tremor",
     "actuation": "tools.research.reproduce.actuation",
+    "emps": "tools.research.reproduce.emps",
     "measured": "tools.research.reproduce.measured",
 }
 OLD_NAMES = {"mismatch-real": "measured"}
