@@ -82,6 +82,19 @@ def test_of_equal_options_the_nearest_to_the_start_is_taken() -> None:
     assert c.least_z == 4.0
 
 
+@pytest.mark.parametrize(("better", "worse", "taken"), [(1, 0, 4.0), (2, 1, 4.0), (3, 0, 8.0), (9, 3, 8.0)])
+def test_a_difference_within_its_standard_error_takes_nothing_from_the_start(
+    better: int, worse: int, taken: float
+) -> None:
+    """A test at 8 is right where one at 4 names too much, and wrong where it names nothing."""
+    too_much = Case(
+        "c", "pair", frozenset("b"), 900, (_set("", 0.0, 0), _set("a", 1.0, z=6.0), _set("b", 0.9, z=9.0)), None
+    )
+    too_little = Case("c", "single", frozenset("a"), 900, (_set("", 0.0, 0), _set("a", 1.0, z=6.0)), None)
+    c = best_of(START, ({"least_z": z} for z in (4.0, 8.0)), [too_much] * better + [too_little] * worse)
+    assert c.least_z == taken
+
+
 def test_boastful_probabilities_are_lowered_on_cases_of_their_own() -> None:
     rng = np.random.default_rng(3)
     cases: list[Case] = []

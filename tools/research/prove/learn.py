@@ -244,11 +244,14 @@ def _weights(x: np.ndarray) -> Constants:
 
 
 def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequence[Case]) -> Constants:
-    """Take the option that gets most cases exactly right; of equals the nearest to ``START`` (by logarithms): what the
-    cases say nothing about stays as it was."""
+    """Take the option that gets most cases exactly right; of those within a standard error of it the nearest to
+    ``START`` (by logarithms): what the cases do not say stays as it was (Breiman et al., Classification and Regression
+    Trees, 1984, section 3.4.3). The error of a difference is the root of the number of cases that differ."""
     tried = [replace(c, **{k: float(v) for k, v in o.items()}) for o in options]
-    counts = [sum(case.right(t) for case in cases) for t in tried]
-    top = [t for t, n in zip(tried, counts, strict=True) if n == max(counts)]
+    right = np.array([[case.right(t) for case in cases] for t in tried])
+    best = right[int(np.argmax(right.sum(axis=1)))]
+    lost = best.sum() - right.sum(axis=1)
+    top = [t for t, less, of in zip(tried, lost, right, strict=True) if less <= np.sqrt(np.sum(of != best))]
     at = np.log([[t.least_z, t.cut, t.cut_share] for t in top])
     prior = np.log([START.least_z, START.cut, START.cut_share])
     return top[int(np.argmin(np.sum((at - prior) ** 2, axis=1)))]
