@@ -12,16 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tests.mismatch.test_prove import silent
 from tools.research.prove.corpus import BLOCK, CORPORA, draw_case, first_block
 from tools.research.prove.corpus_table import corpus_table
 from tools.research.prove.exact import reliability, score_exactly, summarise
 from tools.research.prove.harness import Run, run_corpus
-
-
-def _silent(path: Path) -> dict[str, Any]:
-    """Says that everything agrees."""
-    del path
-    return {"format": 1, "verdict": "agrees", "physics": [], "location": {}, "fit": {}, "seconds": 0.0}
 
 
 def _answer(kind: str, *names: str, **more: Any) -> dict[str, Any]:
@@ -137,7 +132,7 @@ def test_a_run_goes_on_where_it_was_and_its_table_fits(tmp_path: Path) -> None:
 
     def counting(path: Path) -> dict[str, Any]:
         asked.append(path)
-        return _silent(path)
+        return silent(path)
 
     few = Run("develop", 2, 1000)
     first = run_corpus(few, tmp_path, diagnose=counting, progress=lambda text: None)
@@ -165,7 +160,7 @@ def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatc
     from tools.research.prove import harness
 
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc")
-    result = run_corpus(Run("sealed", 2, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
+    result = run_corpus(Run("sealed", 2, 1000), tmp_path, diagnose=silent, progress=lambda text: None)
     assert result.rows == ()
     assert result.summary["cases"] + result.left_out == 2
     assert not list(tmp_path.rglob("recording.toml"))
@@ -173,4 +168,4 @@ def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatc
     assert len(harness.read_rows(tmp_path / "sealed-draws.jsonl")) == 1
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc-dirty")
     with pytest.raises(ValueError, match="commit first"):
-        run_corpus(Run("sealed", 1, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
+        run_corpus(Run("sealed", 1, 1000), tmp_path, diagnose=silent, progress=lambda text: None)
