@@ -28,13 +28,16 @@ class DaqOptions(Options):
 class OutputOptions(Options):
     """Checks the keys of every analog output's entry: the neutral voltage at the stack lies between its limits.
 
-    A subclass has ``lo_V``, ``hi_V``, ``neutral_V`` and ``slew_V_per_s``."""
+    A subclass has ``lo_V`` and ``hi_V``."""
+
+    neutral_V: float = 50.0
+    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
 
     @property
     def limit(self) -> OutputLimit:
         """Return the limits of each output, which the actuation stage follows."""
-        low, high, slew, neutral = (getattr(self, name) for name in ("lo_V", "hi_V", "slew_V_per_s", "neutral_V"))
-        return OutputLimit(low, high, slew, neutral)
+        low, high = (getattr(self, name) for name in ("lo_V", "hi_V"))
+        return OutputLimit(low, high, self.slew_V_per_s, self.neutral_V)
 
     @model_validator(mode="after")
     def _neutral_is_between(self) -> OutputOptions:
@@ -68,7 +71,6 @@ class NiDaqOptions(DaqOptions):
     """Holds the keys of a National Instruments analog input, used through the ``nidaqmx`` package."""
 
     device: str
-    rate_hz: float = Field(gt=0)
     channels: tuple[Annotated[int, Field(ge=0, le=31)], ...] = Field(min_length=1)
     range_V: float = Field(gt=0, le=10)
 
@@ -127,8 +129,6 @@ class DacAmplifierOptions(OutputOptions):
     gain: float = Field(default=20.0, ge=0.1, le=100)
     lo_V: float = Field(default=0.0, ge=0)
     hi_V: float = Field(default=100.0, le=150)
-    neutral_V: float = 50.0
-    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
     read_back: bool = False
 
 
@@ -137,8 +137,6 @@ class E727Options(OutputOptions):
 
     lo_V: float = Field(default=0.0, ge=-30)
     hi_V: float = Field(default=100.0, le=120)
-    neutral_V: float = 50.0
-    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
     rate_hz: float = Field(default=100.0, gt=0, le=200)
 
 
@@ -150,8 +148,6 @@ class NiOutputOptions(OutputOptions):
     gain: float = Field(default=20.0, ge=0.1, le=100)
     lo_V: float = Field(default=0.0, ge=-150)
     hi_V: float = Field(default=100.0, le=150)
-    neutral_V: float = 50.0
-    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
 
 
 class CanAmplifierOptions(OutputOptions):
@@ -161,7 +157,6 @@ class CanAmplifierOptions(OutputOptions):
     hi_V: ClassVar[float] = 100.0
 
     neutral_V: float = Field(default=50.0, ge=0, le=100)
-    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
 
 
 class CanTelemetryOptions(Options):

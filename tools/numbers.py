@@ -17,3 +17,8 @@ def is_finite_number(value: object) -> TypeGuard[int | float]:
 def rms(values: NDArray[np.float64]) -> float:
     """Return the root of the mean square of all ``values``, in their unit; 0 without any."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
+
+
+def vector_rms(vectors: NDArray[np.float64]) -> float:
+    """Return the root of the mean square length of ``vectors`` (n, k), in their unit."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

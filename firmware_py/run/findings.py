@@ -56,8 +56,8 @@ def _latched(title: str, cause: CauseClass, says: str, why: str) -> FindingEntry
     return FindingEntry(title, cause, False, says, why)
 
 
-def _end(title: str, cause: CauseClass, says: str, why: str) -> FindingEntry:
-    return FindingEntry(title, cause, False, says, why, normal=True)
+def _end(title: str, says: str, why: str) -> FindingEntry:
+    return FindingEntry(title, CauseClass.OPERATOR, False, says, why, normal=True)
 
 
 _HOST, _LINK, _DEVICE, _OPERATOR = CauseClass
@@ -314,30 +314,12 @@ class Finding(Enum):
         "{error}",
         "A program that is wrong is not to be trusted with outputs.",
     )
-    STOPPED = _end(
-        "stopped by the operator",
-        _OPERATOR,
-        "stopped by the operator ({signal})",
-        "A person wants the end.",
-    )
+    STOPPED = _end("stopped by the operator", "stopped by the operator ({signal})", "A person wants the end.")
     STOPPED_ON_PAGE = _end(
-        "stopped on the page",
-        _OPERATOR,
-        "stopped by the operator (safe button of the bench page)",
-        "A person wants the end.",
+        "stopped on the page", "stopped by the operator (safe button of the bench page)", "A person wants the end."
     )
-    TARGETS_REACHED = _end(
-        "targets reached",
-        _OPERATOR,
-        "all targets reached",
-        "The experiment is over.",
-    )
-    FINISHED = _end(
-        "finished",
-        _OPERATOR,
-        "run finished",
-        "The time that was asked for is over.",
-    )
+    TARGETS_REACHED = _end("targets reached", "all targets reached", "The experiment is over.")
+    FINISHED = _end("finished", "run finished", "The time that was asked for is over.")
 
 
 def classify_scan_error(error: HalError, stall_ms: float) -> Finding:

@@ -185,11 +185,7 @@ class Die(RegisterFace):
             self._nvm_due_ns = -1
             first, last = self._facts.nvm
             self._nvm = {register: self.registers[register] for register in range(first, last + 1)}
-        if self.frozen:
-            self._clock.skip_past(t_ns)
-        while self._clock.due_ns is not None and self._clock.due_ns <= t_ns:
-            due_ns = self._clock.due_ns
-            self._clock.tick()
+        for due_ns in self._clock.ticks_until(t_ns, frozen=self.frozen):
             self._sample(due_ns)
 
     def _run(self, t_ns: int) -> None:

@@ -153,11 +153,7 @@ class MotionCard:
         return due_ns
 
     def advance_to(self, t_ns: int) -> None:
-        if self.frozen:
-            self._clock.skip_past(t_ns)
-        while self._clock.due_ns is not None and self._clock.due_ns <= t_ns:
-            due_ns = self._clock.due_ns
-            self._clock.tick()
+        for due_ns in self._clock.ticks_until(t_ns, frozen=self.frozen):
             self._now_ns = max(self._now_ns, due_ns)
             self._press_by_plan()
             self._transmit(due_ns)

@@ -215,11 +215,7 @@ class Mpu6050(RegisterFace):
         if 0 <= self._reset_due_ns <= t_ns:
             self._reset_due_ns = -1
             self.registers[PWR_MGMT_1] = 0x40
-        if self.frozen:
-            self._clock.skip_past(t_ns)
-        while self._clock.due_ns is not None and self._clock.due_ns <= t_ns:
-            due_ns = self._clock.due_ns
-            self._clock.tick()
+        for due_ns in self._clock.ticks_until(t_ns, frozen=self.frozen):
             self._step(due_ns)
 
     def _run(self, t_ns: int) -> None:

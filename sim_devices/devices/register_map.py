@@ -12,7 +12,7 @@ Model limits
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 HISTORY = 64
 
@@ -122,6 +122,14 @@ class SampleClock:
     def tick(self) -> None:
         self.ticks += 1
         self.due_ns = self._begin_ns + round(self.ticks * self._period_ns)
+
+    def ticks_until(self, t_ns: int, *, frozen: bool) -> Iterator[int]:
+        """Yield the instant of each tick up to ``t_ns``, after ``tick``. Those of a ``frozen`` part are left out."""
+        if frozen:
+            self.skip_past(t_ns)
+        while (due_ns := self.due_ns) is not None and due_ns <= t_ns:
+            self.tick()
+            yield due_ns
 
 
 class Outputs:

@@ -36,6 +36,7 @@ from hal.jsonable import to_jsonable
 from hal.types import CanFrame, CanStats, PortInfo, ScanConfig
 from sim_devices.plant.hand_file import HandFileError, load_hand
 from tests.conftest import DEFAULT_BENCH
+from tests.recording_text import channel
 from tools.bench.collect import quick_look
 from tools.bench.viewer import Nonsense
 from tools.bench.viewer import _parse as parse_message
@@ -321,19 +322,13 @@ def _json_mcap() -> bytes:
     return out.getvalue()
 
 
-_DESCRIPTOR = """format = 1
+_DESCRIPTOR = (
+    """format = 1
 data = "data.csv"
 rate_hz = 1000.0
 [twin]
 kind = "static"
-[[channels]]
-column = "x"
-role = "input"
-signal = "u"
-unit = "V"
-[[channels]]
-column = "y"
-role = "output"
-signal = "y"
-unit = "V"
 """
+    + channel("x", "input", "u", "V")
+    + channel("y", "output", "y", "V")
+)

@@ -20,6 +20,7 @@ from hal.compiled import kernel
 from tools.calibrate.multi_position import Estimate, MultiPosition, compensate, estimates_of, identify_poses
 from tools.calibrate.still import find_poses
 from tools.errors import InputError
+from tools.numbers import rms, vector_rms
 
 NAMES = ("misalignment_yz", "misalignment_zy", "misalignment_xz", "misalignment_zx", "misalignment_xy")
 NAMES += ("misalignment_yx", "scale_x", "scale_y", "scale_z")
@@ -152,7 +153,7 @@ def fit_gyroscope(
     mean = weight @ rest
     spread = float(student.ppf(0.975, len(rest) - 1)) * np.sqrt(weight @ (rest - mean) ** 2 / (len(rest) - 1))
     estimates |= estimates_of(("bias_x", "bias_y", "bias_z"), mean, spread)
-    angle = float(np.sqrt(np.mean(np.sum(fit.fun.reshape(-1, 3) ** 2, axis=1))))
+    angle = vector_rms(fit.fun.reshape(-1, 3))
     return GyroscopeFit(estimates, angle, condition, len(start), saturated, accelerometer)
 
 
@@ -160,7 +161,7 @@ def _first_scale(raw: Array, bounds: NDArray[np.int64], bias: Array, start: Arra
     """The one scale for all axes, of a wide range, that turns gravity best: the start of the fit."""
     moving = np.concatenate([raw[a:b] - m for (a, b), m in zip(bounds, bias, strict=True)])
     # hands turn at 0.05 to 10 rad/s
-    size = 1.0 / float(np.sqrt(np.mean(moving**2)))
+    size = 1.0 / rms(moving)
     out = np.empty_like(start)
     best, least = size, np.inf
     for scale in size * np.geomspace(0.05, 10.0, 120):

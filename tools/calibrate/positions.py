@@ -27,6 +27,7 @@ from hal.types import STANDARD_GRAVITY
 from tools.calibrate.multi_position import Estimate
 from tools.calibrate.pivot_spline import Basis, Step, gauss_newton, uniform_basis
 from tools.errors import InputError
+from tools.numbers import rms, vector_rms
 
 FIT_HZ = 50.0
 KNOT_S = 0.05
@@ -199,10 +200,10 @@ def fit_positions(readings: Array, field: Array, rate_hz: float, config: Sensing
         solved.x[:k].reshape(-1, 3),
         reach.reshape(-1, 3),
         believed,
-        float(np.sqrt(np.mean(solved.residual[:, :n] ** 2))),
+        rms(solved.residual[:, :n]),
         float(np.linalg.cond(step.information / np.outer(size, size)) ** 0.5),
         seconds,
-        float(np.sqrt(np.mean(np.sum(omega**2, axis=1)))),
+        vector_rms(omega),
         tuple(str(i + 1) for i in range(len(believed))),
     )
     _refuse(fit)
@@ -241,8 +242,8 @@ def _solve(problem: _Problem, basis: Basis, coefficients: Array, believed: Array
         by_curve, by_global = problem.slopes(curves, x)
         residual = measured - problem.predict(curves, x)
         if iteration == 3:  # from here on the readings weigh what they are seen to deserve
-            noise[:n] = max(float(np.sqrt(np.mean(residual[:, :n] ** 2))), 1e-4)
-            noise[n:] = max(float(np.sqrt(np.mean(residual[:, n:] ** 2))), LEAST_FIELD_ERROR * field_size)
+            noise[:n] = max(rms(residual[:, :n]), 1e-4)
+            noise[n:] = max(rms(residual[:, n:]), LEAST_FIELD_ERROR * field_size)
         scale = noise[None, :]
         step = gauss_newton(
             basis,

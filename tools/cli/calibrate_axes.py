@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from hal.types import STANDARD_GRAVITY
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.terminal import table_of
@@ -56,7 +56,7 @@ def three(columns: str) -> tuple[str, str, str]:
 
 def print_parameters(title: str, parameters: dict, notes: list[str], json_file: str | None) -> None:
     """Print a table of estimates with their intervals, and notes; on standard error if JSON is on the other."""
-    to = console() if json_file == "-" else data_console()
+    to = data_console(json_file)
     table = table_of(title, "parameter", "value", "95 % interval")
     for name, e in parameters.items():
         table.add_row(name, f"{e.value:.6g}", f"{e.low:.6g} .. {e.high:.6g}")

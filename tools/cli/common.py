@@ -53,9 +53,9 @@ def console() -> Console:
     return plain_console(stderr=True)
 
 
-def data_console() -> Console:
-    """Return the console for data, on standard output."""
-    return plain_console()
+def data_console(json_file: str | None = None) -> Console:
+    """Return the console for data, on standard output; with ``--json -``, which takes that, the one for people."""
+    return plain_console(stderr=json_file == "-")
 
 
 def print_whole(full: Table, narrow: Table | None = None) -> None:

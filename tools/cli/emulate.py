@@ -14,7 +14,7 @@ import typer
 
 from hal.bench import load_bench
 from tools.cli.bench_option import bench_path
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, console, data_console, print_note
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.terminal import table_of
@@ -84,7 +84,7 @@ def emulate(
         with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
             write_json(served.as_dict(), json_file)
             for note in served.notes:
-                console().print(f"note: {note}", soft_wrap=True)
+                print_note(note)
             if command:
                 status = subprocess.call([str(program), *command[1:]], env={**os.environ, **served.environment})
             else:

@@ -152,8 +152,7 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 
     outputs = Outputs()
     with outputs.part("table"):
-        # with '--json -' standard output belongs to the JSON
-        print_report(report, console() if json_file == "-" else data_console())
+        print_report(report, data_console(json_file))
     with outputs.part("JSON"):
         write_json(report.to_json(), json_file)
     if html is not None or out is not None:
@@ -188,7 +187,7 @@ def _diagnose_folder(
                 progress.update(bar, advance=1, description=row.name)
     need_some(rows)
     rows.sort(key=lambda row: row.name)
-    (console() if json_file == "-" else data_console()).print(batch_report([row.cells for row in rows]))
+    data_console(json_file).print(batch_report([row.cells for row in rows]))
     write_json(batch.to_json(folder, rows), json_file)
     bad = [row for row in rows if row.error]
     if bad:
@@ -238,7 +237,7 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
     for c in made.guess.columns:
         signal = c.signal if c.role in ("input", "output", "context") else ""
         table.add_row(c.name, c.role or "not used", signal, c.unit or "?", f"{min(c.low):.4g}", f"{max(c.high):.4g}")
-    (console() if json_file == "-" else data_console()).print(table)
+    data_console(json_file).print(table)
     write_json(made.to_json(), json_file)
     for heading, lines in (("assumed", made.guess.assumed), ("note", made.guess.notes)):
         for one in lines:
@@ -419,7 +418,7 @@ def simulate(
         rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
             write_text_atomic(out, columns(loaded, simulated))
-        say = console() if json_file == "-" else data_console()
+        say = data_console(json_file)
         for row in rows:
             say.print(row.text(), highlight=False, soft_wrap=True)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)

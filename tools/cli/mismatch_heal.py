@@ -45,7 +45,7 @@ def heal(
         healing.check_bench(file, max_effect)
         out.mkdir(parents=True, exist_ok=True)
         found = healing.heal(path, out, seconds=seconds, runs=runs, say=lambda text: console().print(text))
-        say = console() if json_file == "-" else data_console()
+        say = data_console(json_file)
         for line in healing.lines(found):
             say.print(line, highlight=False, markup=False, soft_wrap=True)
         if found.bench is not None:

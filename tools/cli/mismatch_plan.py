@@ -92,7 +92,7 @@ def plan(
         asked = planning.Asked(
             wish, tuple(inputs or ()), noise, None, size, evaluations, seed, limits, tuple(stack or ())
         )
-        say = console() if json_file == "-" else data_console()
+        say = data_console(json_file)
         if report is None:
             from tools.mismatch.plan.show import print_prospect
 
@@ -116,7 +116,7 @@ def _plan_for(twin: Path, report: dict[str, Any], asked: Any, *, out: Path | Non
         designed = planning.plan_for(
             twin, report, asked, lambda what, done, total: bars.update(bar, completed=done, total=total)
         )
-    print_plan(designed, console() if json_file == "-" else data_console())
+    print_plan(designed, data_console(json_file))
     if out is not None:
         files = write_plan(designed.plan, designed.where, out, designed.stacks)
         draw_plan(designed.plan, designed.where, designed.rivals, dict(designed.sigma), out / PICTURE)

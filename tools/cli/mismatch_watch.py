@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, data_console
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_writable, write_json
@@ -56,7 +56,7 @@ def watch(
         from tools.mismatch.watch.offline import lines, watch_recording
 
         watched = watch_recording(twin, recording, reference, false_alarms_per_hour)
-        say = console() if json_file == "-" else data_console()
+        say = data_console(json_file)
         for line in lines(watched):
             say.print(line, highlight=False, markup=False, soft_wrap=True)
         write_json(watched.to_json(), json_file)

@@ -39,14 +39,14 @@ class ExportReport:
     notes: tuple[str, ...] = ()
 
 
-def export(recording: Recording, out: Path, format: str | None = None, *, overwrite: bool = False) -> ExportReport:
-    """Write ``recording`` in one of ``FORMATS`` or as ``folder`` (None: what the name of ``out`` says, without a suffix
-    the folder). Columns keep their names, values every bit.
+def export(recording: Recording, out: Path, *, overwrite: bool = False) -> ExportReport:
+    """Write ``recording`` in the format that the suffix of ``out`` names, or as a folder if ``out`` has no suffix.
+    Columns keep their names, values every bit.
 
     Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there; ``InputError`` when
     the package that a format needs is not installed.
     """
-    chosen = format or out.suffix.lower().removeprefix(".") or "folder"
+    chosen = out.suffix.lower().removeprefix(".") or "folder"
     if chosen == "folder":
         return export_folder(recording, out)
     if chosen not in FORMATS:

@@ -41,14 +41,14 @@ class StackTwin:
     split: tuple[str, ...]
 
 
-def twin_of_stack(lab: Lab, axis: int, jobs: int = 1) -> StackTwin:
+def twin_of_stack(lab: Lab, axis: int) -> StackTwin:
     """Record stack ``axis``, diagnose it, and write ``twin-stack<N>.toml`` beside the recordings."""
     home = lab.folder / f"stack{axis + 1}"
     profile, rate_hz = PROFILES[0]
     replaced = in_place(lab.config, lab.bench.path, axis, None)
     first = home / "first"
     write_recording(first, *measure_piezo(lab.config, axis, profile, rate_hz, CHECK_S, AMPLITUDE_V, twin=replaced))
-    report = diagnose(load(first), jobs=jobs).to_json()
+    report = diagnose(load(first), jobs=1).to_json()
     groups = groups_of(report)
     split: tuple[str, ...] = ()
     if groups:
@@ -65,7 +65,7 @@ def twin_of_stack(lab: Lab, axis: int, jobs: int = 1) -> StackTwin:
                 lab.config, axis, volts, 1.0 / designed.plan.dt, noise="planned", what="as planned", twin=replaced
             )
             write_recording(planned, *columns)
-            report = diagnose(load_together([first, planned]), jobs=jobs).to_json()
+            report = diagnose(load_together([first, planned]), jobs=1).to_json()
             split = designed.group
     write_text_atomic(home / "report.json", json.dumps(report))
     effects = tuple(str(p["name"]) for p in report["physics"])

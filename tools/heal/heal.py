@@ -103,7 +103,6 @@ def heal(
     seconds: float,
     runs: int,
     name_effects: bool = True,
-    jobs: int = 1,
     say: Say,
     parts: Sequence[Part] = PARTS,
 ) -> Healed:
@@ -122,13 +121,13 @@ def heal(
         say(f"{part.name}: measuring")
         lab = Lab(bench, config, out / "recordings")
         compared = part.compare(lab)
-        effects = _named(compared, jobs) if name_effects else ()
+        effects = _named(compared) if name_effects else ()
         beyond = WITHOUT_REMEDY[part.name](lab) if part.name in WITHOUT_REMEDY else ()
         named = effects, (*(e for e in effects if e not in STACK_EFFECTS), *beyond)
         twin: StackTwin | None = None
         if name_effects and compared.axis is not None:
             say(f"{part.name}: the twin of stack {compared.axis + 1}")
-            twin = twin_of_stack(lab, compared.axis, jobs)
+            twin = twin_of_stack(lab, compared.axis)
         say(f"{part.name}: identifying")
         remedy = Remedy(out / f"{part.name}.toml", out / f"weights-{part.name}.toml", out / f"bench-{part.name}.toml")
         balance = Balance()
@@ -232,12 +231,12 @@ def with_remedy(bench: BenchFile, file: Path, out: Path) -> BenchFile:
     return healed
 
 
-def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
+def _named(compared: Comparison) -> tuple[str, ...]:
     if compared.recording is None:
         return ()
     from tools.mismatch.infer import diagnose
 
-    report = diagnose(compared.recording, jobs=jobs)
+    report = diagnose(compared.recording, jobs=1)
     return tuple(p.name for p in report.physics)
 
 

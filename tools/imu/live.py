@@ -102,8 +102,8 @@ class AutoCalibration:
     left_dps: tuple[float, ...]
     step_g: tuple[float, ...]
     step_dps: tuple[float, ...]
-    limit_g: float
-    limit_dps: float
+    limit_g: float = 0.002
+    limit_dps: float = 0.1
 
     @property
     def verified(self) -> bool:
@@ -123,8 +123,6 @@ def auto_calibrate(
     *,
     settle_s: float = SETTLE_S,
     mean_s: float = MEAN_S,
-    limit_g: float = 0.002,
-    limit_dps: float = 0.1,
     progress: Progress | None = None,
 ) -> AutoCalibration:
     """Settle, average, write minus the offset into the chip's registers, read back, measure again.
@@ -157,6 +155,4 @@ def auto_calibrate(
         tuple(left_gyro.tolist()),
         tuple(((np.array(kept.accel_mps2) - a) / STANDARD_GRAVITY).tolist()),
         tuple(np.degrees(np.array(kept.gyro_rad_s) - w).tolist()),
-        limit_g,
-        limit_dps,
     )

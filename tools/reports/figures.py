@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.arrays import Array
+from tools.numbers import vector_rms
 
 AXES = ("x", "y", "z")
 TREMOR_BAND_HZ = (8.0, 12.0)
@@ -116,14 +117,12 @@ def band_pass(x: Array, rate_hz: float, band_hz: tuple[float, float]) -> Array:
 
 def _compare(before: Array, after: Array) -> BandFigures:
     """Return the rms of vectors (n, k): the root of the summed axis variances."""
-    rms_before, rms_after = (float(1e6 * np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (before, after))
+    rms_before, rms_after = (1e6 * vector_rms(e) for e in (before, after))
     reduction = 100.0 * (1.0 - rms_after / rms_before) if rms_before > 0 else float("nan")
     return BandFigures(rms_before, rms_after, reduction)
 
 
-def tremor_figures(
-    truth: Mapping[str, Array], *, from_ns: int, to_ns: int, band_hz: tuple[float, float] = TREMOR_BAND_HZ
-) -> TremorFigures | None:
+def tremor_figures(truth: Mapping[str, Array], *, from_ns: int, to_ns: int) -> TremorFigures | None:
     """Figures over the truth from ``from_ns`` to ``to_ns`` (bench time); ``None`` when that is less than 1 s.
 
     Filters run over the whole record, so that their own edges fall outside what is scored.
@@ -135,7 +134,7 @@ def tremor_figures(
     if np.count_nonzero(keep) < rate_hz:
         return None
     rigid, tip, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "tip_m", "intended_m"))
-    rigid_band, tip_band = (band_pass(x, rate_hz, band_hz)[keep] for x in (rigid, tip))
+    rigid_band, tip_band = (band_pass(x, rate_hz, TREMOR_BAND_HZ)[keep] for x in (rigid, tip))
     per_axis = {a: _compare(rigid_band[:, [i]], tip_band[:, [i]]) for i, a in enumerate(AXES)}
     # the manipulator's own rest offset is no error of the path: means are taken out
     errors = [x - intended for x in (rigid, tip)]
@@ -144,7 +143,7 @@ def tremor_figures(
     bands = {band: _compare(*(band_pass(e, rate_hz, band)[keep] for e in centred)) for band in BANDS_HZ}
     gain, delay_ms = _voluntary_response(rigid, tip, rate_hz, keep)
     return TremorFigures(
-        band_hz,
+        TREMOR_BAND_HZ,
         (float(t_s[keep][0]), float(t_s[keep][-1])),
         _compare(rigid_band, tip_band),
         per_axis,

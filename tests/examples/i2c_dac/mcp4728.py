@@ -47,8 +47,6 @@ class Mcp4728Options(OutputOptions):
     gain: float = Field(ge=0.1, le=100)
     lo_V: float = Field(default=0.0, ge=0)
     hi_V: float = Field(default=100.0, le=150)
-    neutral_V: float = 50.0
-    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
 
 
 DRIVER = output_driver(Mcp4728, Mcp4728Options)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.recording_text import channel
 from tools.cli.main import app
 from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate_bounds import run_bounded
 
-TEXT = """format = 1
+TEXT = (
+    """format = 1
 data = "data.npz"
 rate_hz = 200.0
 [twin]
@@ -22,17 +24,10 @@ kind = "state_space"
 A = [[0.0, 1.0], [{stiffness}, {damping}]]
 B = [[0.0], [0.5]]
 C = [[1.0, 0.0]]
-[[channels]]
-column = "u"
-role = "input"
-signal = "force"
-unit = "N"
-[[channels]]
-column = "y"
-role = "output"
-signal = "position"
-unit = "mm"
 """
+    + channel("u", "input", "force", "N")
+    + channel("y", "output", "position", "mm")
+)
 
 
 @pytest.fixture

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.recording_text import channel
 from tools.cli.main import app
 from tools.mismatch.recording_load import columns_left_out, load
 
-TEXT = """format = 1
+TEXT = (
+    """format = 1
 data = "data.npz"
 rate_hz = 200.0
 [twin]
@@ -34,17 +36,10 @@ back = 1.0
 unread = 3.0
 fixed = ["back"]
 hold = "zero"
-[[channels]]
-column = "u"
-role = "input"
-signal = "current"
-unit = "A"
-[[channels]]
-column = "y"
-role = "output"
-signal = "angle"
-unit = "rad"
 """
+    + channel("u", "input", "current", "A")
+    + channel("y", "output", "angle", "rad")
+)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import channel
 from tools.mismatch.engine.pose import pose
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.vary import added
@@ -26,7 +27,8 @@ def test_a_delay_of_many_time_constants_is_found(tmp_path: Path) -> None:
         x = decay * x + (1.0 - decay) * 0.12 * seen[k]
     y += 0.45 * (1.0 - np.exp(-np.arange(n) / RATE_HZ / 170.0))
     np.savez(tmp_path / "data.npz", u=u, y=y + rng.normal(0.0, 0.04, n))
-    (tmp_path / "recording.toml").write_text(f"""format = 1
+    (tmp_path / "recording.toml").write_text(
+        f"""format = 1
 data = "data.npz"
 rate_hz = {RATE_HZ}
 [twin]
@@ -37,17 +39,10 @@ B = [[0.092]]
 C = [[1.0]]
 D = [[0.0]]
 hold = "zero"
-[[channels]]
-column = "u"
-role = "input"
-signal = "feed"
-unit = "V"
-[[channels]]
-column = "y"
-role = "output"
-signal = "flow"
-unit = "V"
-""")
+"""
+        + channel("u", "input", "feed", "V")
+        + channel("y", "output", "flow", "V")
+    )
     posed = pose(load(tmp_path / "recording.toml"), 0.3, 0, None, lambda *_: (set(), []))
     place = next(p for p in places(posed.problem, posed.effects, ()) if p.effect.name == "dead_time")
     found = added(posed.problem, posed.base, place)

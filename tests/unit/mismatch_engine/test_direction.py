@@ -8,24 +8,14 @@ import numba
 import numpy as np
 import pytest
 
+from tests.recording_text import channel
 from tests.unit.mismatch_engine.cases import Array
 from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 RATE_HZ = 100.0
 SUBSTEPS = 20
-CHANNELS = """
-[[channels]]
-column = "u"
-role = "input"
-signal = "{}"
-unit = "{}"
-[[channels]]
-column = "y"
-role = "output"
-signal = "{}"
-unit = "{}"
-"""
+CHANNELS = channel("u", "input", "{}", "{}") + channel("y", "output", "{}", "{}")
 DAMPER = """
 [twin]
 kind = "ode"

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
+from tests.recording_text import channel
 from tests.unit.mismatch_engine.cases import Array
 from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 RATE_HZ, SUBSTEPS = 200.0, 20
-DRIVE = """
+DRIVE = (
+    """
 format = 1
 data = "data.npz"
 rate_hz = 200.0
@@ -35,22 +37,11 @@ stiffness = 27.0
 motor_inertia = 0.021
 load_drag = 0.047
 hold = "zero"
-[[channels]]
-column = "torque"
-role = "input"
-signal = "torque"
-unit = "N m"
-[[channels]]
-column = "motor"
-role = "output"
-signal = "motor"
-unit = "rad"
-[[channels]]
-column = "load"
-role = "output"
-signal = "load"
-unit = "rad"
 """
+    + channel("torque", "input", "torque", "N m")
+    + channel("motor", "output", "motor", "rad")
+    + channel("load", "output", "load", "rad")
+)
 
 
 @numba.njit

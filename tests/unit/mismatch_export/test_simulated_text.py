@@ -8,28 +8,24 @@ from pathlib import Path
 import numpy as np
 from typer.testing import CliRunner
 
+from tests.recording_text import channel
 from tools.cli.main import app
 from tools.mismatch.export.run import as_read
 from tools.mismatch.recording_load import load
 
-COLUMNS = """
+COLUMNS = (
+    """
 format = 1
 data = "data.csv"
 rate_hz = 10.0
 [twin]
 kind = "columns"
-[[channels]]
-column = "x"
-role = "output"
-signal = "x"
-unit = "mm"
-[[channels]]
-column = "sim"
-role = "input"
-signal = "simulated_x"
-unit = "mm"
 """
-SLIDING = """
+    + channel("x", "output", "x", "mm")
+    + channel("sim", "input", "simulated_x", "mm")
+)
+SLIDING = (
+    """
 format = 1
 data = "data.csv"
 rate_hz = 10.0
@@ -37,17 +33,10 @@ rate_hz = 10.0
 kind = "mechanical_axis"
 [twin.parameters]
 mass = 1.0
-[[channels]]
-column = "sim"
-role = "input"
-signal = "force"
-unit = "N"
-[[channels]]
-column = "x"
-role = "output"
-signal = "position"
-unit = "mm"
 """
+    + channel("sim", "input", "force", "N")
+    + channel("x", "output", "position", "mm")
+)
 
 
 def _recorded(folder: Path, text: str, offset: float) -> Path:

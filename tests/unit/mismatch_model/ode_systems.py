@@ -8,25 +8,14 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from tests.recording_text import channel
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 
 RATE_HZ = 100.0
 
 
-CHANNELS = """
-[[channels]]
-column = "u"
-role   = "input"
-signal = "command"
-unit   = "V"
-
-[[channels]]
-column = "y"
-role   = "output"
-signal = "angle"
-unit   = "rad"
-"""
+CHANNELS = channel("u", "input", "command", "V") + channel("y", "output", "angle", "rad")
 
 
 MOTOR = """

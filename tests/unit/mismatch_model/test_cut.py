@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import stack_channels
 from tools.errors import InputError, OutputError, RecordingError
 from tools.mismatch.cut import cut, cut_columns
 from tools.mismatch.recording_load import load
@@ -26,18 +27,7 @@ gain_um_per_V = 0.12
 [split]
 fit = [0, 300]
 
-[[channels]]
-column = "u"
-role = "input"
-signal = "command"
-unit = "V"
-
-[[channels]]
-column = "z"
-role = "output"
-signal = "displacement"
-unit = "um"
-"""
+""" + stack_channels("u", "z")
 
 
 def write(folder: Path, t: np.ndarray, u: np.ndarray, clock: str) -> Path:

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import channel
 from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 
-GOOD = """
+GOOD = (
+    """
 format = 1
 title = "piezo"
 data = "data.csv"
@@ -21,23 +23,11 @@ rate_hz = 1000.0
 kind = "piezo_stack"
 [twin.parameters]
 gain_um_per_V = 0.125
-[[channels]]
-column = "command_mV"
-role = "input"
-signal = "command"
-unit = "mV"
-[[channels]]
-column = "z"
-role = "output"
-signal = "displacement"
-unit = "nm"
-noise_rms = 70.0
-[[channels]]
-column = "temp"
-role = "context"
-signal = "temperature"
-unit = "K"
 """
+    + channel("command_mV", "input", "command", "mV")
+    + channel("z", "output", "displacement", "nm", 70.0)
+    + channel("temp", "context", "temperature", "K")
+)
 
 
 def rows(n: int = 80) -> list[str]:

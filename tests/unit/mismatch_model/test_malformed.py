@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import channel
 from tests.unit.mismatch_model.test_loader import GOOD
 from tools.errors import RecordingError
 from tools.mismatch.engine.join import joined
@@ -14,7 +15,8 @@ from tools.mismatch.engine.pose import ranges_of
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.make import make
 
-PLANT = """
+PLANT = (
+    """
 format = 1
 data = "data.csv"
 rate_hz = 1000.0
@@ -22,17 +24,10 @@ rate_hz = 1000.0
 kind = "{kind}"
 [twin.parameters]
 {parameters}
-[[channels]]
-column = "command_mV"
-role = "input"
-signal = "{input}"
-unit = "{unit}"
-[[channels]]
-column = "z"
-role = "output"
-signal = "position"
-unit = "m"
 """
+    + channel("command_mV", "input", "{input}", "{unit}")
+    + channel("z", "output", "position", "m")
+)
 
 
 def space(parameters: str) -> str:

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from hal.trust import trust_program
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Settings
+from tests.recording_text import channel
 from tests.unit.mismatch_model.ode_systems import CHANNELS, MOTOR, RATE_HZ, command, pendulum, recorded
 from tools.errors import RecordingError
 from tools.mismatch.engine.reach import not_tried
@@ -124,19 +125,7 @@ y0 = [0.02]
 
 def test_columns_of_simulated_output_are_a_twin_that_says_what_could_not_be_tried(tmp_path: Path) -> None:
     u = command()
-    columns = """
-[[channels]]
-column = "u"
-role   = "input"
-signal = "simulated_angle"
-unit   = "rad"
-
-[[channels]]
-column = "y"
-role   = "output"
-signal = "angle"
-unit   = "rad"
-"""
+    columns = channel("u", "input", "simulated_angle", "rad") + channel("y", "output", "angle", "rad")
     recording = recorded(tmp_path, '[twin]\nkind = "columns"\n', u, 1.02 * u + 0.1, columns)
     twin = make(recording)
     model = Model(twin)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import channel
 from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.recording_units import si_unit
@@ -33,18 +34,9 @@ kind = "state_space"
 A = [[{-POLE}]]
 B = [[{POLE}]]
 C = [[{gain}]]
-[[channels]]
-column = "u"
-role = "input"
-signal = "drive"
-unit = "{units[0]}"
-[[channels]]
-column = "y"
-role = "output"
-signal = "level"
-unit = "{units[1]}"
-noise_rms = {0.01 * factors[1]}
 """
+        + channel("u", "input", "drive", units[0])
+        + channel("y", "output", "level", units[1], 0.01 * factors[1])
     )
     return folder
 
@@ -103,17 +95,9 @@ v = "(drive - 50 * x - 20 * v) / mass"
 [twin.parameters]
 mass = 0.01
 {more}
-[[channels]]
-column = "u"
-role = "input"
-signal = "drive"
-unit = "mN"
-[[channels]]
-column = "y"
-role = "output"
-signal = "x"
-unit = "{unit}"
 """
+        + channel("u", "input", "drive", "mN")
+        + channel("y", "output", "x", unit)
     )
     return folder
 

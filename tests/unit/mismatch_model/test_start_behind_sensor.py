@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from sim_devices.physics.catalogue import EFFECTS
+from tests.recording_text import channel
 from tests.unit.mismatch_engine.cases import recording
 from tools.mismatch.engine.pose import pose
 from tools.mismatch.engine.projected import Projected
@@ -38,7 +39,8 @@ def shaft(folder: Path) -> Path:
             read += h * (v - read) / LAG_S
             v += h * (u[k] - DAMPING * v)
     np.savez(folder / "data.npz", u=u, y=y + rng.normal(0.0, NOISE, n))
-    (folder / "recording.toml").write_text(f"""format = 1
+    (folder / "recording.toml").write_text(
+        f"""format = 1
 data = "data.npz"
 rate_hz = {RATE_HZ}
 [twin]
@@ -47,17 +49,10 @@ kind = "mechanical_axis"
 mass = 1.0
 damping = {DAMPING}
 hold = "zero"
-[[channels]]
-column = "u"
-role = "input"
-signal = "force"
-unit = "N"
-[[channels]]
-column = "y"
-role = "output"
-signal = "velocity"
-unit = "m/s"
-""")
+"""
+        + channel("u", "input", "force", "N")
+        + channel("y", "output", "velocity", "m/s")
+    )
     return folder / "recording.toml"
 
 

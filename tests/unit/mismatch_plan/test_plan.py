@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Stage
+from tests.recording_text import channel, stack_channels
 from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.mismatch.placed import Placed
@@ -34,18 +35,7 @@ DESCRIPTOR = """format = 1
 [twin]
 kind = "piezo_stack"
 parameters = {{ gain_um_per_V = 0.12, offset_um = 0.0, hold = "linear" }}
-[[channels]]
-column = "command_V"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "displacement_um"
-role = "output"
-signal = "displacement"
-unit = "um"
-{noise}
-"""
+""" + stack_channels("command_V", "displacement_um")
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +48,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     y = 0.12 * (lfilter([1 - a], [1, -a], u - u[0]) + u[0]) + np.random.default_rng(1).normal(0, NOISE_UM, N)
     table = np.column_stack([u, y])
     np.savetxt(folder / "data.csv", table, delimiter=",", header="command_V,displacement_um", comments="")
-    text = DESCRIPTOR.format(data='data = "data.csv"\n', noise=f"noise_rms = {NOISE_UM}")
+    text = DESCRIPTOR.format(data='data = "data.csv"\n') + f"noise_rms = {NOISE_UM}\n"
     (folder / "recording.toml").write_text(text)
     return folder
 
@@ -273,7 +263,7 @@ def test_a_report_with_an_equivalent_group_is_planned_for(recorded: Path, report
 
 def test_before_any_recording_a_description_without_data_is_enough(tmp_path: Path):
     file = tmp_path / "recording.toml"
-    file.write_text(DESCRIPTOR.format(data="", noise="noise_rms = 0.02"))
+    file.write_text(DESCRIPTOR.format(data="") + "noise_rms = 0.02\n")
     found = prospect(file, Asked(Wish(amplitude=30.0, centre=50.0, duration_s=3.0)))
     assert {"hysteresis", "creep"} <= {s.name for s in found.found.visible}
     assert found.channels["temperature"] == ("temperature_sensitivity",)
@@ -343,18 +333,9 @@ rate_hz = 500.0
 [twin]
 kind = "mechanical_axis"
 parameters = { inverse_mass = 2.0, damping = 1.0, stiffness = 100.0 }
-[[channels]]
-column = "f"
-role = "input"
-signal = "force"
-unit = "N"
-[[channels]]
-column = "x"
-role = "output"
-signal = "position"
-unit = "m"
-noise_rms = 1e-5
 """
+        + channel("f", "input", "force", "N")
+        + channel("x", "output", "position", "m", 1e-5)
     )
     with pytest.raises(InputError, match="none of its inputs is in V"):
         limits_of(open_situation(file, Asked()), Asked(bench={"low": 0.0, "high": 100.0, "neutral": 50.0, "rate": 1e4}))
@@ -435,7 +416,7 @@ def test_what_is_not_known_of_a_twin_is_said(tmp_path: Path):
     with pytest.raises(InputError, match="no standard channels"):
         prospect(file, Asked(noise=0.1))
     quiet = tmp_path / "recording.toml"
-    quiet.write_text(DESCRIPTOR.format(data="", noise=""))
+    quiet.write_text(DESCRIPTOR.format(data=""))
     with pytest.raises(InputError, match="noise of 'displacement' is not known"):
         prospect(quiet, Asked(Wish(amplitude=30.0)))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.recording_text import stack_channels
 from tools.cli.main import app
 from tools.mismatch.engine.many import changes_between, repeated_noise
 from tools.mismatch.engine.report import BetweenRecordings
@@ -18,7 +19,7 @@ from tools.mismatch.together import load_together
 TEMPERATURES = (19.0, 27.0, 22.5, 31.0, 24.0)
 
 
-def write(folder: Path, k: int, play: float = 0.0, n: int = 1200, drive: int | None = None, text: str = "") -> Path:
+def write(folder: Path, k: int, play: float = 0.0, n: int = 1200, drive: int | None = None) -> Path:
     """A stack whose gain falls by 0.4 %/K, with a concealed play operator of weight ``play``."""
     t = np.arange(n) / 200.0
     d = k if drive is None else drive
@@ -32,8 +33,7 @@ def write(folder: Path, k: int, play: float = 0.0, n: int = 1200, drive: int | N
     folder.mkdir(parents=True)
     np.savetxt(folder / "data.csv", np.column_stack([volts, um]), delimiter=",", header="command_V,um", comments="")
     (folder / "recording.toml").write_text(
-        text
-        or f"""format = 1
+        f"""format = 1
 data = "data.csv"
 rate_hz = 200.0
 [conditions]
@@ -42,17 +42,8 @@ operator = "{"AB"[k % 2]}"
 [twin]
 kind = "piezo_stack"
 parameters = {{ gain_um_per_V = 0.12, offset_um = 0.0, hold = "linear" }}
-[[channels]]
-column = "command_V"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "um"
-role = "output"
-signal = "displacement"
-unit = "um"
 """
+        + stack_channels("command_V", "um")
     )
     return folder
 

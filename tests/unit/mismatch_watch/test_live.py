@@ -13,6 +13,7 @@ from sim_devices.config import emulation_config
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
 from tests.conftest import DEFAULT_BENCH
+from tests.recording_text import channel
 from tools.errors import InputError
 from tools.mismatch.export.run import free_run
 from tools.mismatch.recording_load import load
@@ -25,23 +26,17 @@ VOLTS = LAYOUT["volts"]
 START_S = 0.5
 SECONDS = 40
 BENCH_TWIN = 'format = 1\n[twin]\nkind = "instrument"\n[twin.parameters]\nbench = "bench.toml"\nhand = "bench"\n'
-STACK_TWIN = """format = 1
+STACK_TWIN = (
+    """format = 1
 [twin]
 kind = "piezo_stack"
 [twin.parameters]
 gain_um_per_V = 0.125
 offset_um = 0.0
-[[channels]]
-column = "command_1"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "stroke_1"
-role = "output"
-signal = "displacement"
-unit = "m"
 """
+    + channel("command_1", "input", "command", "V")
+    + channel("stroke_1", "output", "displacement", "m")
+)
 
 
 @pytest.fixture(scope="module")

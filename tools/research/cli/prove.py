@@ -13,6 +13,10 @@ from tools.errors import InputError
 from tools.output import check_folder, check_writable, write_json
 
 
+def _say(text: str) -> None:
+    console().print(text, soft_wrap=True)
+
+
 def prove(
     cases: Annotated[int, typer.Option(min=1, help="Recordings to draw.")] = 40,
     seed: Annotated[
@@ -54,17 +58,9 @@ def prove(
         from tools.research.prove.runner import tool
         from tools.research.prove.table import show
 
-        err = console()
-        result = run_proof(
-            cases,
-            seed,
-            jobs or os.cpu_count() or 1,
-            keep,
-            max_samples=samples,
-            diagnose=tool,
-            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
-        )
-        show(result, err if json_file == "-" else data_console())
+        processes = jobs or os.cpu_count() or 1
+        result = run_proof(cases, seed, processes, keep, max_samples=samples, diagnose=tool, progress=_say)
+        show(result, data_console(json_file))
         write_json(result.to_json(), json_file)
 
 
@@ -89,11 +85,10 @@ def _prove_corpus(
         raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
     limit = float("inf") if minutes is None else minutes
     run = Run(cast(Name, corpus), cases, samples, limit, jobs or os.cpu_count() or 1, first)
-    err = console()
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))
-        result = run_corpus(run, folder, progress=lambda text: err.print(text, markup=False, soft_wrap=True))
-    (err if json_file == "-" else data_console()).print(corpus_table(result))
+        result = run_corpus(run, folder, progress=_say)
+    data_console(json_file).print(corpus_table(result))
     write_json(result.to_json(), json_file)
 
 
@@ -123,21 +118,13 @@ def calibrate(
         from tools.research.prove.calibration import calibrate as run_calibration
         from tools.research.prove.calibration import write_constants
 
-        err = console()
         limit = float("inf") if minutes is None else minutes
-        body, left = run_calibration(
-            keep,
-            cases,
-            samples,
-            limit,
-            partial=partial,
-            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
-        )
+        body, left = run_calibration(keep, cases, samples, limit, partial=partial, progress=_say)
         if body is None:
             if not left:
                 raise InputError(f"--cases {cases}: too few of them can be searched to learn from; take more cases")
-            err.print(f"{left} of {cases} cases are still to be done; run the same command again", soft_wrap=True)
+            _say(f"{left} of {cases} cases are still to be done; run the same command again")
             return
         file = write_constants(body)
-        err.print(f"constants written: {file}", soft_wrap=True)
+        _say(f"constants written: {file}")
         write_json(body, json_file)

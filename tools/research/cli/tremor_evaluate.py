@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
-from tools.cli.common import JsonOption, clear_errors, console, data_console, print_whole
+from tools.cli.common import JsonOption, clear_errors, console, data_console, print_note, print_whole
 from tools.cli.run import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
@@ -84,7 +84,7 @@ def evaluate(
         horizons = _horizons(horizons_ms)
         cases = [c for source in recordings for c in cases_from(source, not as_recorded, not as_recorded)]
         for note in dict.fromkeys(f"{c.name}: {note}" for c in cases for note in c.notes):
-            console().print(f"note: {note}", soft_wrap=True)
+            print_note(note)
         with spinner(console()) as show:
             results = evaluate_cases(cases, methods, horizons, progress=show)
             behaviour = manners(methods) if with_manners else []

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli.common import JsonOption, clear_errors, console, print_whole
+from tools.cli.common import JsonOption, clear_errors, console, print_note, print_whole
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_bytes_atomic, write_json, write_text_atomic
 
@@ -78,7 +78,7 @@ def inspect(
         rule = Rule(band_hz=(low_hz, high_hz))
         result = [inspect(signal, rule) for signal in signals]
         for note in dict.fromkeys(note for s in signals for note in s.notes):
-            console().print(f"note: {note}", soft_wrap=True)
+            print_note(note)
         if json_file != "-":
             print_whole(table(result, whole=True), table(result, whole=False))
         outputs = Outputs()

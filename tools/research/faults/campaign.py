@@ -20,6 +20,7 @@ import numpy as np
 from hal.bench import load_bench
 from hal.children import begin_as_worker
 from tools.interrupt import keep_what_is_there, need_some
+from tools.output import write_text_atomic
 from tools.research.faults.fault import Fault
 from tools.research.faults.judge import ENDED_WELL, Observation
 from tools.research.faults.pairs import draw_pairs
@@ -275,9 +276,7 @@ class _Kept:
     def write(self, trial: Trial, observations: list[Observation]) -> list[Observation]:
         path = self._path(trial)
         if path is not None:
-            part = path.with_suffix(".part")
-            part.write_text(json.dumps([asdict(o) for o in observations]), encoding="utf-8")
-            part.replace(path)
+            write_text_atomic(path, json.dumps([asdict(o) for o in observations]))
         return observations
 
 

@@ -6,7 +6,7 @@ counts once. "Grouped" is the weaker score: names that the report itself calls e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise, permutations
 from types import MappingProxyType
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tools.research.prove import guests
-from tools.research.prove.score import coverage, names_of
+from tools.research.prove.score import count_true, coverage, names_of
 
 Row = Mapping[str, Any]
 EXPECTED = MappingProxyType(
@@ -105,11 +105,6 @@ def reliability(pairs: Iterable[Sequence[float]]) -> dict[str, Any]:
     return {"names": len(data), "expected_calibration_error": error, "bins": bins}
 
 
-def _count(rows: Sequence[Row], key: str) -> list[int]:
-    have = [r for r in rows if r.get(key) is not None]
-    return [sum(bool(r[key]) for r in have), len(have)]
-
-
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Every figure over all rows, and per kind of twin; counts are [number, of]."""
     apart = {kind: [r for r in rows if r["twin_kind"] == kind] for kind in dict.fromkeys(KINDS.values())}
@@ -127,13 +122,13 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     cpu_s = sorted(float(r["cpu_s"]) for r in rows if r.get("cpu_s") is not None)
     return {
         "cases": len(rows),
-        "verdict_right": _count(rows, "verdict_right"),
-        "first_right": _count(named, "first_right"),
-        "set_right_single": _count(single, "set_right"),
-        "set_right_pair": _count(pairs, "set_right"),
-        "grouped_right": _count(named, "grouped_right"),
-        "unknown_unexplained": _count(unknown, "verdict_right"),
-        "null_right": _count(nulls, "verdict_right"),
+        "verdict_right": count_true(rows, "verdict_right"),
+        "first_right": count_true(named, "first_right"),
+        "set_right_single": count_true(single, "set_right"),
+        "set_right_pair": count_true(pairs, "set_right"),
+        "grouped_right": count_true(named, "grouped_right"),
+        "unknown_unexplained": count_true(unknown, "verdict_right"),
+        "null_right": count_true(nulls, "verdict_right"),
         "extra_names": [sum(r["false_names"] > 0 and r["kind"] != "unknown" for r in missing), len(named)],
         "wrong_not_flagged": [sum(not r["flagged"] for r in wrong), len(named)],
         "false_names_given_missing": [sum(r["false_names"] for r in missing), len(missing)],
@@ -147,18 +142,3 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
             "longest": cpu_s[-1] if cpu_s else None,
         },
     }
-
-
-def compare_paired(old: Sequence[Row], new: Sequence[Row]) -> dict[str, Any]:
-    """Compare both engines on their common cases: per score [both right, old alone, new alone, neither]."""
-    by_case = {r["case"]: r for r in old}
-    both = [(by_case[r["case"]], r) for r in new if r["case"] in by_case]
-    scores: dict[str, Callable[[Row], bool]] = {
-        key: (lambda r, key=key: bool(r[key])) for key in ("verdict_right", "set_right", "grouped_right")
-    }
-    scores["no_false_name"] = lambda r: r["false_names"] == 0
-    out: dict[str, Any] = {"cases": len(both)}
-    for key, right in scores.items():
-        marks = [(right(a), right(b)) for a, b in both]
-        out[key] = [marks.count(m) for m in ((True, True), (True, False), (False, True), (False, False))]
-    return out

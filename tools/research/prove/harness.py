@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -168,8 +168,3 @@ def _remember_draw(folder: Path, run: Run, revision: str) -> None:
     entry = {"revision": revision, "cases": run.cases, "date": time.strftime("%Y-%m-%d")}
     with (folder / "sealed-draws.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
-
-
-def sealed_draws(folder: Path) -> Sequence[dict[str, Any]]:
-    """Every draw of the sealed corpus that this folder knows of."""
-    return read_rows(folder / "sealed-draws.jsonl")

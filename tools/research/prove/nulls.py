@@ -17,6 +17,7 @@ from scipy.stats import beta
 
 from firmware_py.recording.revision import git_revision
 from hal.children import use_one_thread
+from tools.output import write_text_atomic
 from tools.research.prove import draw, seal
 from tools.research.prove.catalog import TWINS
 from tools.research.prove.noise import KINDS
@@ -114,13 +115,12 @@ def nulls(
     seed: int | None = None,
     jobs: int = 2,
     *,
-    doc: Path | None = None,
     rows_file: Path | None = None,
     max_samples: int = 12_000,
     diagnose: Diagnose = tool,
     say: Callable[[str], None] | None = None,
 ) -> NullResult:
-    """Run ``n`` null recordings; write ``doc`` unless None.
+    """Run ``n`` null recordings and return their rows.
 
     ``rows_file`` (JSON) keeps every row as soon as it is there; what it already holds counts, so that a run of hours
     may be interrupted and continued with the same answer. Its seed stands when none is given. ValueError when it comes
@@ -152,20 +152,14 @@ def nulls(
         seconds = before + time.perf_counter() - start
         if rows_file is not None:
             head = {"seed": seed, "max_samples": max_samples, "revision": revision, "seconds": seconds}
-            partial = rows_file.with_suffix(".part")
-            partial.write_text(json.dumps({**head, "rows": rows}, indent=1))
-            partial.replace(rows_file)
+            write_text_atomic(rows_file, json.dumps({**head, "rows": rows}, indent=1))
         alarm = f"  FALSE ALARM {row['verdict']} {','.join(row['said'])}" if row["alarm"] else ""
         tell(
             f"{len(rows)}/{n - missed}, {sum(r['alarm'] for r in rows)} false alarms, {seconds:.0f} s  "
             f"#{row['index']} {row['twin']} {row['noise']} {row['cpu_s']:.1f} s of CPU{alarm}"
         )
     rows = sorted((r for r in rows if r["index"] < n), key=lambda r: r["index"])
-    result = NullResult(seed, tuple(rows), before + time.perf_counter() - start, max_samples, revision)
-    if doc is not None:
-        doc.parent.mkdir(parents=True, exist_ok=True)
-        doc.write_text(document(result))
-    return result
+    return NullResult(seed, tuple(rows), before + time.perf_counter() - start, max_samples, revision)
 
 
 def kept(file: Path) -> NullResult:
@@ -273,9 +267,7 @@ def main() -> None:
         p.error("--page-only needs --rows")
     try:
         result = (
-            kept(a.rows)
-            if a.page_only
-            else nulls(a.n, a.seed, a.jobs, doc=None, rows_file=a.rows, max_samples=a.max_samples)
+            kept(a.rows) if a.page_only else nulls(a.n, a.seed, a.jobs, rows_file=a.rows, max_samples=a.max_samples)
         )
         text = document(result, read_page(a.out) if a.out.exists() else "")
         write_result(a.out, text)

@@ -18,6 +18,7 @@ import numpy as np
 from firmware_py.recording.revision import git_revision
 from hal.children import begin_as_worker
 from tools.interrupt import keep_what_is_there, need_some
+from tools.output import write_text_atomic
 from tools.research.prove import draw, guests, seal
 from tools.research.prove.disk import write
 from tools.research.prove.plans import SELDOM
@@ -146,8 +147,7 @@ def prove(
     with keep_what_is_there():
         for done in diagnose_all({k: paths[k] for k in left}, jobs, diagnose):
             reports[done.name] = done
-            (kept / "unfinished").write_text(json.dumps(asdict(done), indent=1))
-            (kept / "unfinished").replace(kept / f"{done.name}.json")
+            write_text_atomic(kept / f"{done.name}.json", json.dumps(asdict(done), indent=1))
             say(f"{len(reports)}/{len(paths)}  {done.name}  {done.wall_s:.1f} s, {done.cpu_s:.1f} s of CPU")
     need_some(reports)
     opened = seal.opened(folder / "sealed", digest)

@@ -175,7 +175,8 @@ def score(
     return row
 
 
-def _share(rows: Sequence[Mapping[str, Any]], key: str) -> list[int]:
+def count_true(rows: Sequence[Mapping[str, Any]], key: str) -> list[int]:
+    """Return in how many of ``rows`` the answer to ``key`` is true, and how many have an answer."""
     have = [r for r in rows if r.get(key) is not None]
     return [sum(bool(r[key]) for r in have), len(have)]
 
@@ -207,20 +208,20 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     cpu_s = sorted(r["cpu_s"] for r in rows if r.get("cpu_s") is not None)
     return {
         "cases": len(rows),
-        "named_severity_4_up": _share([r for r in single if r["severity"] >= 4], "ok"),
-        "named_severity_2": _share([r for r in single if r["severity"] < 4], "ok"),
-        "named_in_equivalence_group": _share(single, "in_group"),
+        "named_severity_4_up": count_true([r for r in single if r["severity"] >= 4], "ok"),
+        "named_severity_2": count_true([r for r in single if r["severity"] < 4], "ok"),
+        "named_in_equivalence_group": count_true(single, "in_group"),
         "extra_names": [sum(len(r["extra"]) > 0 for r in single), len(single)],
-        "pairs_both_named": _share(pairs, "ok"),
-        "false_alarms": _share(controls, "false_alarm"),
-        "controls_verdict_right": _share(controls, "ok"),
-        "unknown_unexplained": _share(unknowns, "unexplained"),
-        "unknown_with_right_signal": _share(unknowns, "ok"),
-        "output_right": _share(single + pairs, "outputs_ok"),
-        "stage_right": _share(single + pairs, "stage_ok"),
-        "depends_right": _share(single + pairs, "depends_ok"),
+        "pairs_both_named": count_true(pairs, "ok"),
+        "false_alarms": count_true(controls, "false_alarm"),
+        "controls_verdict_right": count_true(controls, "ok"),
+        "unknown_unexplained": count_true(unknowns, "unexplained"),
+        "unknown_with_right_signal": count_true(unknowns, "ok"),
+        "output_right": count_true(single + pairs, "outputs_ok"),
+        "stage_right": count_true(single + pairs, "stage_ok"),
+        "depends_right": count_true(single + pairs, "depends_ok"),
         "explained_90_percent": [sum(r["explained"] >= 0.9 for r in foreseeable), len(foreseeable)],
-        "below_noise": _share([r for r in rows if r["ratio"] is not None], "below_noise"),
+        "below_noise": count_true([r for r in rows if r["ratio"] is not None], "below_noise"),
         "ci_coverage": [sum(c["covered"] for c in cover), len(cover)],
         "errors": [sum(bool(r.get("error")) for r in rows), len(rows)],
         "cpu_s_median": cpu_s[len(cpu_s) // 2] if cpu_s else None,

@@ -16,6 +16,7 @@ from firmware_py.tremor.config import AdaptiveConfig
 from hal.arrays import Array
 from sim_devices.plant.kernel import STEP_NS
 from tools.closed_loop.simulate import SimulatedRun
+from tools.numbers import vector_rms
 from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ, band_pass
 from tools.research.tremor.cases import RATE_HZ
 from tools.research.tremor.ideal import bound_residual
@@ -61,7 +62,7 @@ def strongest(truth: Mapping[str, Array], from_ns: int, to_ns: int) -> Swing:
 
 def band_rms_um(x: Array, keep: NDArray[np.bool_], band_hz: tuple[float, float] = TREMOR_BAND_HZ) -> float:
     """``x`` (n, 3) m in ``band_hz`` over the rows ``keep``, as a vector, um."""
-    return float(1e6 * np.sqrt(np.mean(np.sum(band_pass(x, RATE_HZ, band_hz)[keep] ** 2, axis=1))))
+    return 1e6 * vector_rms(band_pass(x, RATE_HZ, band_hz)[keep])
 
 
 def known_tremor(truth: Mapping[str, Array], body: Array, config: ActuationConfig) -> Array:
@@ -137,7 +138,7 @@ def fine_motion(run: SimulatedRun, from_ns: int, to_ns: int) -> FineMotion:
     for moved in (run.fine[:, 3:], run.fine[:, :3]):
         error = moved - path
         fast = band_pass(error - error[keep].mean(axis=0), FINE_HZ, (ABOVE_HZ[0], 0.5 * FINE_HZ))[keep]
-        found.append(float(1e6 * np.sqrt(np.mean(np.sum(fast**2, axis=1)))))
+        found.append(1e6 * vector_rms(fast))
     return FineMotion(*found)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from firmware_py.tremor.adaptive_design import design_adaptive
 from firmware_py.tremor.config import TremorConfig
+from tools.numbers import vector_rms
 from tools.research.tremor.bound import lift
 from tools.research.tremor.cases import RATE_HZ, Case
 from tools.research.tremor.evaluate import run_case, with_horizon
@@ -34,7 +33,7 @@ def lifted_after(case: Case, lead_s: float, horizon_ms: int, config: TremorConfi
     left = case.truth[:stop].copy()
     left[start:] = residual(part, ahead, round(horizon_ms * 1e-3 * RATE_HZ))
     scored = lift(left, design_adaptive(with_horizon(config, case, "adaptive", 0)))[-round(WINDOW_S * RATE_HZ) :]
-    return float(np.sqrt(np.mean(np.sum(scored**2, axis=1))))
+    return vector_rms(scored)
 
 
 def adapting(cases: Sequence[Case], horizon_ms: int, config: TremorConfig | None = None) -> dict[str, list[float]]:

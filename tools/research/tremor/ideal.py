@@ -33,6 +33,7 @@ from firmware_py.tremor.estimator import Estimator
 from hal.arrays import Array
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
+from tools.numbers import vector_rms
 from tools.reports.figures import tremor_figures
 from tools.research.tremor.bench_variant import merged, write_variant
 from tools.research.tremor.bound import bank_features, lift
@@ -125,7 +126,7 @@ def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) 
         _alone(samples, wanted, noise),
         _bound(samples, wanted, keep),
     )
-    loop, alone, bound = (float(np.sqrt(np.mean(np.sum(lift(x, design)[keep] ** 2, axis=1)))) for x in left)
+    loop, alone, bound = (vector_rms(lift(x, design)[keep]) for x in left)
     return loop, alone, bound
 
 

@@ -9,6 +9,7 @@ from scipy.signal import hilbert
 
 from firmware_py.tremor.adaptive_design import AdaptiveDesign
 from hal.arrays import Array
+from tools.numbers import vector_rms
 from tools.reports.figures import TREMOR_BAND_HZ, VOLUNTARY_HZ, band_pass
 from tools.research.tremor.bound import SKIP_S, lift
 from tools.research.tremor.cases import RATE_HZ, Case, low_pass
@@ -32,10 +33,6 @@ class Score:
     slow_percent: float
 
 
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
-
-
 def _scored(n: int) -> slice:
     return slice(round(SKIP_S * RATE_HZ), n - round(_EDGE_S * RATE_HZ))
 
@@ -57,8 +54,8 @@ def score(case: Case, ahead: Array, ticks: int, design: AdaptiveDesign) -> Score
         (band_pass(case.truth, RATE_HZ, TREMOR_BAND_HZ), band_pass(left, RATE_HZ, TREMOR_BAND_HZ)),
         (lift(case.truth, design), lift(left, design)),
     ):
-        whole = _rms(before[keep])
-        parts.append(100.0 * _rms(after[keep]) / whole if whole > 0.0 else float("nan"))
+        whole = vector_rms(before[keep])
+        parts.append(100.0 * vector_rms(after[keep]) / whole if whole > 0.0 else float("nan"))
     return Score(parts[0], parts[1], parts[2], _delay_ms(case, left, keep), _slow_percent(case, ahead, keep))
 
 
