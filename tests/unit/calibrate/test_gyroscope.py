@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.lab import measure_tumble
 from sim_devices.plant.sensors import sensor_unit
+from tests.command import micron
 from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.field_axes import fit_turn, strap
 from tools.calibrate.gyroscope import fit_gyroscope, rate_matrix, turned_gravity
 from tools.calibrate.logs import load_log
-from tools.cli.main import app
 from tools.errors import InputError
 
 G = 9.80665
@@ -107,7 +106,7 @@ def test_set_and_reset_part_the_offset_from_hard_iron() -> None:
 @pytest.mark.parametrize("command", ["gyroscope", "magnetometer"])
 def test_a_missing_column_ends_with_2(tmp_path: Path, command: str) -> None:
     np.savez(tmp_path / "log.npz", other=np.arange(100.0))
-    result = CliRunner().invoke(app, ["calibrate", command, str(tmp_path / "log.npz")])
+    result = micron("calibrate", command, tmp_path / "log.npz")
     assert result.exit_code == 2
     assert "other" in result.output
 

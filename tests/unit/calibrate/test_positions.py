@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from firmware_py.sensing.config import SensingConfig
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.lab_motion import measure_motion
 from sim_devices.plant.sensors import sensor_unit
+from tests.command import micron
 from tests.unit.sensing.rigid_body import AXES, TIP, FIELD_uT, Motion, rc_filter
 from tools.calibrate.pivot_spline import uniform_basis
 from tools.calibrate.positions import fit_positions
-from tools.cli.main import app
 from tools.errors import InputError
 
 EVERY = 5
@@ -97,7 +96,7 @@ def test_the_emulated_instrument_end_to_end(tmp_path: Path) -> None:
     out = tmp_path / "positions.toml"
     arguments = ["calibrate", "positions", str(tmp_path / "data.npz"), "--bench", str(bench), "--rate-hz", "1000"]
     arguments += ["--out", str(out), "--json", str(tmp_path / "fit.json")]
-    result = CliRunner().invoke(app, arguments)
+    result = micron(*arguments)
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "fit.json").read_text())
     error = np.sqrt(np.mean((np.array(found["positions_m"]) - true) ** 2))
@@ -110,6 +109,6 @@ def test_a_recording_of_something_else_ends_with_2(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", gyro_x=np.zeros(100))
     bench = Path(__file__).parents[3] / "benches" / "micron.toml"
     arguments = ["calibrate", "positions", str(tmp_path / "other.npz"), "--bench", str(bench), "--rate-hz", "100"]
-    result = CliRunner().invoke(app, arguments)
+    result = micron(*arguments)
     assert result.exit_code == 2
     assert "gyro_x" in result.output

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tools.calibrate.quick import QuickResult, flat, free_fall, turn
 from tools.calibrate.still import remove_drift
-from tools.cli.main import app
 from tools.errors import InputError
 
 ONE_G = 16384.0
@@ -166,7 +165,7 @@ def test_terminal_and_json_say_the_same(tmp_path: Path) -> None:
     np.savez(tmp_path / "flat.npz", x=log[:, 0], y=log[:, 1], z=log[:, 2])
     command = ["calibrate", "accelerometer", str(tmp_path / "flat.npz"), "--method", "flat", "--columns", "x,y,z"]
     command += ["--rate-hz", "100", "--json", str(tmp_path / "r.json")]
-    done = CliRunner().invoke(app, command)
+    done = micron(*command)
     assert done.exit_code == 0
     assert "residual: none left" in done.stdout
     assert "condition 1.0" in done.stdout
@@ -176,4 +175,4 @@ def test_terminal_and_json_say_the_same(tmp_path: Path) -> None:
     assert told["condition"] == pytest.approx(1.0)
     assert told["missing"] == list(FIVE)
     assert told["noise"] == pytest.approx(5.0, rel=0.2)
-    assert json.loads(CliRunner().invoke(app, [*command[:-1], "-"]).stdout) == told
+    assert json.loads(micron(*command[:-1], "-").stdout) == told

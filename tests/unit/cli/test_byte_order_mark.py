@@ -7,11 +7,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.unit.mismatch_report.canned import missing_physics
 from tests.unit.mismatch_report.systems import recording
-from tools.cli.main import app
 
 ROOT = Path(__file__).parents[3]
 HAND = "t_s,x_um,y_um,z_um\n" + "".join(f"{i / 500},{i % 7},{i % 5},{i % 3}\n" for i in range(2000))
@@ -41,22 +40,22 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_a_byte_order_mark_changes_nothing(place: Path, file: str, words: str) -> None:
     (place / file).write_bytes(b"\xef\xbb\xbf" + (place / file).read_bytes())
-    done = CliRunner().invoke(app, words.split())
+    done = micron(*words.split())
     assert done.exit_code in ((0, 1) if words.startswith("doctor") else (0,)), done.output
 
 
 @pytest.mark.parametrize("ending", [".toml", ".py"])
 def test_a_twin_with_a_byte_order_mark_runs(place: Path, ending: str) -> None:
     twin = place / f"twin{ending}"
-    assert CliRunner().invoke(app, ["mismatch", "apply", "rec", "report.json", "--out", twin.name]).exit_code == 0
+    assert micron("mismatch", "apply", "rec", "report.json", "--out", twin.name).exit_code == 0
     twin.write_bytes(b"\xef\xbb\xbf" + twin.read_bytes())
-    done = CliRunner().invoke(app, ["mismatch", "simulate", twin.name, "rec", "--trust"])
+    done = micron("mismatch", "simulate", twin.name, "rec", "--trust")
     assert done.exit_code == 0, done.output
 
 
 def test_text_of_16_bits_is_refused_with_what_to_do(place: Path) -> None:
     text = place / "rec" / "recording.toml"
     text.write_bytes(text.read_text().encode("utf-16"))
-    done = CliRunner().invoke(app, ["mismatch", "simulate", "rec"])
+    done = micron("mismatch", "simulate", "rec")
     assert done.exit_code == 2
     assert "save it as UTF-8" in done.stderr

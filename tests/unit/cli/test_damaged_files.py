@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.unit.mismatch_report.canned import missing_physics
 from tests.unit.mismatch_report.systems import recording
 from tools.cli.common import Exit, clear_errors
-from tools.cli.main import app
 
 
 @pytest.fixture
@@ -26,7 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def refused(words: str, folder: Path) -> str:
     before = sorted(folder.rglob("*"))
-    done = CliRunner().invoke(app, words.split())
+    done = micron(*words.split())
     assert done.exit_code == Exit.BAD_INPUT, (done.output, done.exception)
     assert sorted(folder.rglob("*")) == before
     return done.stderr.splitlines()[-1]
@@ -117,7 +116,7 @@ def test_an_unreadable_recording_of_a_folder_is_a_row_of_the_table(
     (folder / "all").mkdir()
     (folder / "all" / "locked.toml").write_text("format = 1\n")
     monkeypatch.setattr(Path, "read_text", locked)
-    done = CliRunner().invoke(app, ["mismatch", "diagnose", "all", "--jobs", "1"])
+    done = micron("mismatch", "diagnose", "all", "--jobs", "1")
     assert done.exit_code == Exit.BAD_INPUT
     assert "Permission denied" in " ".join(done.stdout.split())
 
@@ -128,6 +127,6 @@ def test_an_unreadable_recording_of_a_folder_is_a_row_of_the_table(
 )
 def test_a_report_that_names_another_recording_is_noted(folder: Path, named: str | None, is_noted: bool) -> None:
     (folder / "report.json").write_text(json.dumps({**missing_physics().to_json(), "recording": named}))
-    done = CliRunner().invoke(app, ["mismatch", "apply", "rec", "report.json", "--out", "twin.toml"])
+    done = micron("mismatch", "apply", "rec", "report.json", "--out", "twin.toml")
     assert done.exit_code == 0, done.output
     assert ("note: the report names the recording elsewhere" in done.stderr) is is_noted

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from tools.cli.main import app
+from tests.command import micron
 from tools.data import registry
 from tools.data.registry import public_sets
 from tools.research.reports.data_page import PAGE, page
@@ -87,7 +87,7 @@ def listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def call(*words: str) -> Result:
-    return CliRunner().invoke(app, ["data", *words])
+    return micron("data", *words)
 
 
 def test_what_is_fetched_is_whole_and_not_fetched_again(server: str, listed: Path, asked: list[str]):

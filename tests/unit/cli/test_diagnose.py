@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from firmware_py.scheduler.histogram import DurationHistogram
-from tools.cli.main import app
+from tests.command import micron
 from tools.diagnose.latency import octaves
 from tools.diagnose.ramp import staircase
 from tools.diagnose.scope import BLOCKS, sparkline
 
 
 def run(*arguments: str) -> Result:
-    return CliRunner().invoke(app, list(arguments))
+    return micron(*arguments)
 
 
 def result_of(path: Path) -> dict:
@@ -46,10 +46,10 @@ def test_scan_has_no_table_for_a_kind_of_bus_that_the_bench_lacks():
 
 
 def test_scan_asks_before_it_writes():
-    refused = CliRunner().invoke(app, ["scan", "--virtual", "--probe", "write"], input="n\n")
+    refused = micron("scan", "--virtual", "--probe", "write", input="n\n")
     assert refused.exit_code == 2
     assert "Write to every address" in refused.output
-    alone = CliRunner().invoke(app, ["scan", "--virtual", "--probe", "write"])
+    alone = micron("scan", "--virtual", "--probe", "write")
     assert alone.exit_code == 2
     assert "micron: you did not agree, so nothing was done; --yes agrees beforehand" in alone.output
 

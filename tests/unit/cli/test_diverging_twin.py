@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.recording_text import channel
-from tools.cli.main import app
 from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate_bounds import run_bounded
@@ -46,7 +45,7 @@ def describe(folder: Path, stiffness: float, damping: float) -> None:
 @pytest.mark.filterwarnings("error")
 def test_a_twin_that_grows_without_bound_is_refused(folder: Path, damping: float) -> None:
     describe(folder, -57.0, damping)
-    done = CliRunner().invoke(app, ["mismatch", "simulate", ".", "--out", "simulated.csv", "--json", "figures.json"])
+    done = micron("mismatch", "simulate", ".", "--out", "simulated.csv", "--json", "figures.json")
     assert done.exit_code == 2, done.exception
     last = done.stderr.splitlines()[-1]
     assert last.startswith("micron: .: the twin diverges: its position is ")
@@ -57,7 +56,7 @@ def test_a_twin_that_grows_without_bound_is_refused(folder: Path, damping: float
 
 def test_a_twin_that_stays_bounded_is_as_before(folder: Path) -> None:
     describe(folder, -57.0, -2.5)
-    done = CliRunner().invoke(app, ["mismatch", "simulate", "."])
+    done = micron("mismatch", "simulate", ".")
     assert done.exit_code == 0, done.output
     assert "position: residual" in done.stdout
 

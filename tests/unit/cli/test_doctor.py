@@ -9,9 +9,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 
 ROOT = Path(__file__).parents[3]
 
@@ -29,13 +28,13 @@ def test_a_bench_file_made_as_the_guide_says_is_whole(place: Path):
     (made,) = re.findall(r"^mkdir lab && .*$", guide, re.MULTILINE)
     subprocess.run(made, shell=True, check=True, cwd=place)
     for words in (["doctor"], ["run", "--virtual", "--seconds", "0.5", "--picture", "lab/run.png"]):
-        done = CliRunner().invoke(app, [*words, "--bench", "lab/micron.toml"])
+        done = micron(*words, "--bench", "lab/micron.toml")
         assert done.exit_code == 0, done.output
 
 
 def test_calibration_that_is_not_there_is_missing_before_a_run_says_so(place: Path):
     shutil.copy("benches/micron.toml", "alone.toml")
-    done = CliRunner().invoke(app, ["doctor", "--bench", "alone.toml", "--json", "-"])
+    done = micron("doctor", "--bench", "alone.toml", "--json", "-")
     assert done.exit_code == 4
     assert done.stdout.count('"missing"') == 4  # three files, and how many
     assert "copy it beside the bench file" in done.stdout
@@ -44,14 +43,14 @@ def test_calibration_that_is_not_there_is_missing_before_a_run_says_so(place: Pa
 def test_no_word_of_a_remedy_is_broken_on_a_terminal_of_80_columns(place: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "80")
     shutil.copy("benches/micron.toml", "alone.toml")
-    done = CliRunner().invoke(app, ["doctor", "--bench", "alone.toml", "--json", "found.json"])
+    done = micron("doctor", "--bench", "alone.toml", "--json", "found.json")
     assert all(len(line.rstrip()) <= 80 for line in done.output.splitlines())
     words = {w for f in json.loads(Path("found.json").read_text())["findings"] for w in f["remedy"].split()}
     assert words <= set(done.output.split())
 
 
 def test_a_bench_that_ships_is_known_by_its_name_and_another_name_is_refused() -> None:
-    assert CliRunner().invoke(app, ["doctor", "--bench", "micron-can"]).exit_code in (0, 1)  # 1: of the machine
-    done = CliRunner().invoke(app, ["doctor", "--bench", "nowhere"])
+    assert micron("doctor", "--bench", "micron-can").exit_code in (0, 1)  # 1: of the machine
+    done = micron("doctor", "--bench", "nowhere")
     assert done.exit_code == 2
     assert "nowhere: no such bench file, and none of that name ships; these do: endoscope" in done.output

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e999"])
@@ -31,7 +30,7 @@ from tools.cli.main import app
     ],
 )
 def test_a_number_that_is_not_finite_is_refused(words: str, number: str) -> None:
-    done = CliRunner().invoke(app, [*words.split(), number])
+    done = micron(*words.split(), number)
     assert done.exit_code == 2
     text = " ".join(done.stderr.split())
     assert (
@@ -42,13 +41,13 @@ def test_a_number_that_is_not_finite_is_refused(words: str, number: str) -> None
 
 @pytest.mark.parametrize("scale", ["0", "-1", "1e300"])
 def test_a_hand_is_scaled_by_a_factor_that_leaves_a_motion(scale: str) -> None:
-    done = CliRunner().invoke(app, ["simulate", "--hand", "h.csv", "--scale", scale])
+    done = micron("simulate", "--hand", "h.csv", "--scale", scale)
     assert done.exit_code == 2
     assert "--scale" in done.stderr
 
 
 @pytest.mark.parametrize("words", ["--help", "mismatch plan --help", "run --help"])
 def test_the_help_is_as_before(words: str) -> None:
-    done = CliRunner().invoke(app, words.split())
+    done = micron(*words.split())
     assert done.exit_code == 0
     assert "Usage" in done.stdout

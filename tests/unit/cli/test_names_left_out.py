@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.recording_text import channel
-from tools.cli.main import app
 from tools.mismatch.recording_load import columns_left_out, load
 
 TEXT = (
@@ -61,6 +60,6 @@ def test_names_of_an_ode_that_belong_to_nothing_are_noted(folder: Path) -> None:
 
 def test_columns_that_no_channel_reads_are_named(folder: Path) -> None:
     assert columns_left_out(folder) == ["spare"]
-    done = CliRunner().invoke(app, ["mismatch", "simulate", "."])
+    done = micron("mismatch", "simulate", ".")
     assert done.exit_code == 0, done.output
     assert "columns not used: spare" in done.stderr

@@ -6,10 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.unit.mismatch_report.systems import recording
-from tools.cli.main import app
 from tools.errors import InputError
 from tools.output import check_folder, check_writable, files_read
 
@@ -52,7 +51,7 @@ REFUSED = {
 def test_a_result_that_would_replace_data_is_refused_before_the_work(folder: Path, case: str) -> None:
     shutil.copytree("rec", "other")
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    done = CliRunner().invoke(app, REFUSED[case].split())
+    done = micron(*REFUSED[case].split())
     assert done.exit_code == 2, done.output
     assert "; name a" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -84,6 +83,6 @@ def test_the_files_of_an_input_are_found_by_what_descriptions_name(folder: Path)
 
 def test_force_of_new_replaces_a_descriptor(folder: Path) -> None:
     arguments = ["mismatch", "new", "rec/data.npz", "--rate", "1000"]
-    assert CliRunner().invoke(app, arguments).exit_code == 2
-    done = CliRunner().invoke(app, [*arguments, "--force"])
+    assert micron(*arguments).exit_code == 2
+    done = micron(*arguments, "--force")
     assert done.exit_code == 0, done.output

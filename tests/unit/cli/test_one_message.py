@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 
 
 def refused(*words: str) -> str:
     """Return the one message with which a command refuses ``words``."""
-    result = CliRunner().invoke(app, list(words))
+    result = micron(*words)
     assert result.exit_code == 2, (result.exit_code, result.output, result.exception)
     assert not result.stdout
     assert "Traceback" not in result.stderr

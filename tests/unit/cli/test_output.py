@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tools.cli.common import Exit, clear_errors
-from tools.cli.main import app
 from tools.errors import InputError, OutputError
 from tools.output import Outputs, check_writable, save_figure, write_bytes_atomic, write_json
 
@@ -70,7 +69,7 @@ def test_a_run_does_not_begin_when_its_result_has_no_place(option: str, monkeypa
         raise AssertionError("the run has begun")
 
     monkeypatch.setattr("tools.cli.run.load_bench", never)
-    done = CliRunner().invoke(app, ["run", option, "/proc/result"])
+    done = micron("run", option, "/proc/result")
     assert done.exit_code == Exit.BAD_INPUT
     assert not isinstance(done.exception, AssertionError)
 

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from sim_devices.plant.lab import main as lab
+from tests.command import micron
 from tests.examples.conftest import install
 from tests.unit.calibrate.test_gyroscope import log
 from tests.unit.cli.test_examples import ALL, EXAMPLE
-from tools.cli.main import app
 
 ROOT = Path(__file__).parents[3]
 BENCHES, DOCS, CHIP = ROOT / "benches", ROOT / "docs", ROOT / "tests" / "examples" / "i2c_chip"
@@ -81,7 +81,7 @@ def example(name: str) -> str:
 
 
 def call(name: str) -> Result:
-    return CliRunner().invoke(app, shlex.split(example(name), comments=True))
+    return micron(*shlex.split(example(name), comments=True))
 
 
 def logs() -> None:
@@ -107,7 +107,7 @@ def recorded_stack(folder: str) -> None:
 
 def diagnosed() -> None:
     recorded_stack("rec")
-    done = CliRunner().invoke(app, ["mismatch", "diagnose", "rec", "--json", "rec.json"])
+    done = micron("mismatch", "diagnose", "rec", "--json", "rec.json")
     assert done.exit_code == 0, done.output
 
 
@@ -159,7 +159,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One second of the default bench."""
     folder = tmp_path_factory.mktemp("recording")
     files = ["--record", str(folder / "run.mcap"), "--picture", str(folder / "run.png")]
-    done = CliRunner().invoke(app, ["run", "--virtual", "--seconds", "1", *files])
+    done = micron("run", "--virtual", "--seconds", "1", *files)
     assert done.exit_code == 0, done.output
     return folder / "run.mcap"
 
@@ -199,9 +199,9 @@ def test_the_worked_example_works(name: str, place: Path, request: pytest.Fixtur
 
 def test_a_part_of_a_run_differs_because_of_what_came_before_it(recording: Path, tmp_path: Path) -> None:
     part = str(tmp_path / "part.mcap")
-    cut = CliRunner().invoke(app, ["export", str(recording), part, "--raw", "--from", "0.5", "--to", "0.8"])
+    cut = micron("export", recording, part, "--raw", "--from", "0.5", "--to", "0.8")
     assert cut.exit_code == 0, cut.output
-    done = CliRunner().invoke(app, ["replay", part])
+    done = micron("replay", part)
     assert done.exit_code == 1
     said = " ".join(done.output.split())
     assert re.search(r"of 300 ticks differ; the first: row 0, \w+: \S+ recorded, \S+ replayed", said)

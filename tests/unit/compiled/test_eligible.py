@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from firmware_py.compiled.eligible import check_compiled, reasons_against_bench
 from hal.bench import load_bench
 from hal.errors import BenchError
-from tools.cli.main import app
+from tests.command import micron
 
 BENCHES = Path(__file__).parents[3] / "benches"
 
@@ -88,7 +87,7 @@ def test_each_device_without_kernels_is_named(tmp_path: Path):
 def test_asked_for_it_is_bad_input(tmp_path: Path, bench: str, what: str):
     record = tmp_path / "run.mcap"
     file = str(bench_of_ni(tmp_path) if bench == "NI" else BENCHES / f"{bench}.toml")
-    result = CliRunner().invoke(app, ["run", "--bench", file, "--realtime", "--compiled", "--record", str(record)])
+    result = micron("run", "--bench", file, "--realtime", "--compiled", "--record", record)
     assert result.exit_code == 2
     assert what in " ".join(result.output.split())
     assert not record.exists()
@@ -107,7 +106,7 @@ def test_asked_for_it_is_bad_input_of_every_command(tmp_path: Path, command: lis
     file = str(bench_of_ni(tmp_path) if bench == "NI" else BENCHES / f"{bench}.toml")
     made = tmp_path / "made"
     own = ["--recordings", str(made)] if command[0] == "bench" else ["--json", str(made)]
-    result = CliRunner().invoke(app, [*command, "--bench", file, "--compiled", *own])
+    result = micron(*command, "--bench", file, "--compiled", *own)
     assert result.exit_code == 2
     assert f"micron: {file}: --compiled cannot run: " in " ".join(result.output.split())
     assert what in " ".join(result.output.split())
@@ -122,7 +121,7 @@ def test_asked_for_it_is_bad_input_of_every_command(tmp_path: Path, command: lis
     ],
 )
 def test_what_excludes_it_is_bad_input_of_every_command(words: list[str], what: str):
-    result = CliRunner().invoke(app, words)
+    result = micron(*words)
     assert result.exit_code == 2
     assert what in " ".join(result.output.split())
 
@@ -141,7 +140,7 @@ def test_a_run_says_which_of_its_options_keeps_it_in_python(
         raise BenchError("the run is not part of this test")
 
     monkeypatch.setattr("tools.cli.run.prepare", stop)
-    result = CliRunner().invoke(app, ["run", "--realtime", "--bench", str(BENCHES / "micron.toml"), *words])
+    result = micron("run", "--realtime", "--bench", BENCHES / "micron.toml", *words)
     said = " ".join(result.output.split())
     assert f"loop: Python, because this run cannot be compiled: {why} micron:" in said
     assert "--compiled runs it" not in said
@@ -157,12 +156,12 @@ def test_a_run_says_which_of_its_options_keeps_it_in_python(
 )
 def test_a_spin_or_a_processor_that_cannot_be_is_bad_input(words: list[str], what: str):
     bench = str(BENCHES / "micron-e727.toml")
-    result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", *words])
+    result = micron("run", "--bench", bench, "--realtime", *words)
     assert result.exit_code == 2
     assert what in " ".join(result.output.split())
 
 
 def test_a_processor_is_of_real_time():
-    result = CliRunner().invoke(app, ["run", "--virtual", "--cpu", "0"])
+    result = micron("run", "--virtual", "--cpu", "0")
     assert result.exit_code == 2
     assert "--realtime" in result.output

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.conftest import DEFAULT_BENCH
-from tools.cli.main import app
 
 
 @pytest.mark.parametrize(
@@ -18,6 +17,6 @@ from tools.cli.main import app
     ],
 )
 def test_an_option_for_a_bus_that_is_not_there_is_refused(bench: str, words: str, message: str) -> None:
-    done = CliRunner().invoke(app, ["emulate", bench, *words.split(), "--", "true"])
+    done = micron("emulate", bench, *words.split(), "--", "true")
     assert done.exit_code == 2, done.output
     assert message in done.stderr

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.command import micron
 from tests.conftest import DEFAULT_BENCH
-from tools.cli.main import app
 
 BENCHES = DEFAULT_BENCH.parent
 
@@ -30,7 +29,7 @@ BENCHES = DEFAULT_BENCH.parent
     ],
 )
 def test_bad_input_is_one_clear_line_and_exit_2(arguments: list[str], says: str) -> None:
-    result = CliRunner().invoke(app, arguments)
+    result = micron(*arguments)
     assert result.exit_code == 2
     assert result.stdout == ""
     assert len(result.stderr.strip().splitlines()) == 1
@@ -41,6 +40,6 @@ def test_a_fault_of_a_part_that_the_bench_has_not_is_refused(tmp_path: Path) -> 
     text = DEFAULT_BENCH.read_text(encoding="utf-8").replace("can0", "can7")
     bench = tmp_path / "bench.toml"
     bench.write_text(text, encoding="utf-8")
-    result = CliRunner().invoke(app, ["faults", "--bench", str(bench), "--only", "can: bus silent"])
+    result = micron("faults", "--bench", bench, "--only", "can: bus silent")
     assert result.exit_code == 2
     assert "'can: bus silent' breaks 'can0', which is not on this bench" in result.stderr

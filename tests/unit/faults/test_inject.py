@@ -6,15 +6,14 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from firmware_py.app import run_in_process
 from firmware_py.inject import check_injections, effect_of, late_starts, parse_injection
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
+from tests.command import micron
 from tests.conftest import DEFAULT_BENCH
-from tools.cli.main import app
 
 
 @pytest.fixture
@@ -91,7 +90,7 @@ def test_a_run_says_before_it_begins_that_a_fault_comes_too_late(monkeypatch: py
         raise typer.Exit(7)
 
     monkeypatch.setattr("tools.cli.run._run_emulated", ended)
-    result = CliRunner().invoke(app, ["run", "--virtual", "--seconds", "2", "--inject", "daq0:loss=1,from_s=3"])
+    result = micron("run", "--virtual", "--seconds", "2", "--inject", "daq0:loss=1,from_s=3")
     assert result.exit_code == 7
     assert result.stderr.startswith("note: --inject daq0: from_s = 3 s counts from opening the bench")
     assert "more --seconds\n" in result.stderr
@@ -134,7 +133,7 @@ def test_a_real_bus_needs_the_limit_an_emulated_one_does_not(lab: Path):
     ],
 )
 def test_the_command_refuses_before_a_port_is_touched(lab: Path, arguments: list[str], says: str):
-    result = CliRunner().invoke(app, ["run", "--bench", str(lab), *arguments])
+    result = micron("run", "--bench", lab, *arguments)
     assert result.exit_code == 2
     assert says in result.stderr
     assert result.stdout == ""

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 from tools.errors import InputError
 from tools.research.faults.long_page import with_block
 from tools.research.faults.long_run import EIGHTHS, PARTS, Eighths
@@ -28,12 +27,12 @@ def test_another_page_is_not_overwritten(tmp_path: Path):
     page.write_text("# My notes\n")
     with pytest.raises(InputError, match="not a page of long runs"):
         with_block(page, "wires", "")
-    result = CliRunner().invoke(app, ["soak", "--seconds", "60", "--out", str(page)])
+    result = micron("soak", "--seconds", "60", "--out", page)
     assert (result.exit_code, page.read_text()) == (2, "# My notes\n")
 
 
 def test_a_start_of_the_clock_needs_a_clock():
-    result = CliRunner().invoke(app, ["soak", "--without-wires", "--start-ns", "5"])
+    result = micron("soak", "--without-wires", "--start-ns", "5")
     assert result.exit_code == 2
     assert "--start-ns moves the clock of the buses" in result.stderr
 

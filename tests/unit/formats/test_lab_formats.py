@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.writer import RecordingWriter
+from tests.command import micron
 from tests.unit.recording.samples import COLUMNS, METADATA, make_rows, same_bits
 from tools.bench import open_run
 from tools.calibrate.logs import load_log
-from tools.cli.main import app
 from tools.errors import InputError, RecordingError
 from tools.formats.export import export
 from tools.formats.netcdf import dataset
@@ -78,7 +77,7 @@ def test_torn_and_foreign_files_get_one_message(run: Recording, tmp_path: Path, 
         assert str(torn) in str(caught.value)
         assert "\n" not in str(caught.value)
     torn.write_bytes(b"time,volts_0\n0,1\n" * 100)
-    result = CliRunner().invoke(app, ["noise", str(torn), "--rate-hz", "100"])
+    result = micron("noise", torn, "--rate-hz", "100")
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert f"torn.{ending}: not a" in result.stderr

@@ -13,6 +13,7 @@ from firmware_py.endoscope.wiring import open_sensors
 from hal.arrays import Array
 from hal.bench import load_bench, open_bench
 from hal.errors import BenchError
+from tests.command import micron
 from tools.cli.main import app
 from tools.errors import InputError
 from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_still, evaluate_turned
@@ -273,7 +274,7 @@ def test_clashing_addresses_are_refused_with_the_strap_that_frees_one(command: l
     path = tmp_path / "bench.toml"
     other = '[device.other]\ndriver = "mpu6050"\nbus = "i2c0"\naddress = 0x68\n'
     path.write_text(BENCH.format(driver="bmx055", address=CHIPS["bmx055"]) + other)
-    done = CliRunner().invoke(app, [*command, "--bench", str(path), "--virtual"])
+    done = micron(*command, "--bench", path, "--virtual")
     assert done.exit_code == 2
     assert "0x68 on 'i2c0' is claimed by the gyro of 'chip' (BMX055) and 'other' (MPU6050)" in done.stderr
     assert "tie AD0 of 'other' high" in done.stderr

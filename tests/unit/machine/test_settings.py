@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from firmware_py.machine.attendant import attend, attend_workers
 from firmware_py.machine.processors import format_processors, parse_processors
@@ -27,7 +26,7 @@ from firmware_py.machine.workers import (
     raise_workers,
 )
 from firmware_py.scheduler import RealtimeConfig, realtime
-from tools.cli.main import app
+from tests.command import micron
 from tools.diagnose.findings import setting_findings
 
 CPUS = "sys/devices/system/cpu"
@@ -294,7 +293,7 @@ def test_a_run_that_may_not_raise_them_says_so(monkeypatch: pytest.MonkeyPatch):
 
 def test_doctor_shows_and_sets_another_tree(lab: Tree):
     def doctor(*more: str) -> dict:
-        done = CliRunner().invoke(app, ["doctor", "--root", str(lab.root), "--json", "-", *more])
+        done = micron("doctor", "--root", lab.root, "--json", "-", *more)
         assert done.exit_code == 0, done.output
         return json.loads(done.stdout)
 
@@ -303,7 +302,7 @@ def test_doctor_shows_and_sets_another_tree(lab: Tree):
     result = doctor("--set")
     assert len(result["set"]) == 6
     assert {f["part"]: f["verdict"] for f in result["findings"]}["governor"] == "ok"
-    assert CliRunner().invoke(app, ["doctor", "--root", str(lab.root / "nowhere")]).exit_code == 2
+    assert micron("doctor", "--root", lab.root / "nowhere").exit_code == 2
 
 
 @given(st.sets(st.integers(0, 255)))

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from tools.cli.main import app
+from tests.command import micron
 
 
 def analysed(folder: Path, columns: dict[str, np.ndarray], *options: str) -> tuple[Result, list[str]]:
     np.savez(folder / "rest.npz", **columns)
     files = ["--json", str(folder / "noise.json"), "--picture", str(folder / "noise.png")]
-    done = CliRunner().invoke(app, ["noise", str(folder / "rest.npz"), "--rate-hz", "100", *files, *options])
+    done = micron("noise", folder / "rest.npz", "--rate-hz", "100", *files, *options)
     found = folder / "noise.json"
     return done, list(json.loads(found.read_text())["columns"]) if found.exists() else []
 

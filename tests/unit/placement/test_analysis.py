@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 from tools.research.placement.analysis import DOWN_40, RC_RAD_S, Conditions, all_accelerometers, conventional
 from tools.research.placement.configurations import micron_000, micron_004
 
@@ -81,7 +80,7 @@ def test_the_command_with_a_file_of_eight_axes(tmp_path: Path) -> None:
     axes = [[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0]]
     eight.write_text(f"format = 1\npositions_mm = {places}\naxes = {axes}\n")
     arguments = ["sensing", "variance", "micron-004", str(eight), "--picture", str(tmp_path / "v.png")]
-    result = CliRunner().invoke(app, [*arguments, "--json", str(tmp_path / "v.json")])
+    result = micron(*arguments, "--json", tmp_path / "v.json")
     assert result.exit_code == 0, result.output
     six, more, gyroscopes = json.loads((tmp_path / "v.json").read_text())["configurations"]
     assert np.all(np.array(more["alpha"]) < 1.001 * np.array(six["alpha"]))
@@ -104,7 +103,7 @@ def test_the_command_with_a_file_of_eight_axes(tmp_path: Path) -> None:
 def test_a_bad_configuration_ends_with_2(tmp_path: Path, text: str, words: str) -> None:
     path = tmp_path / "c.toml"
     path.write_text(text)
-    result = CliRunner().invoke(app, ["sensing", "variance", str(path)])
+    result = micron("sensing", "variance", path)
     assert result.exit_code == 2
     assert words in result.output.replace("\n", " ")
-    assert CliRunner().invoke(app, ["sensing", "variance", "cuboid"]).exit_code == 2
+    assert micron("sensing", "variance", "cuboid").exit_code == 2

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from firmware_py.control.plan import load_plan
 from firmware_py.frame import AXES
@@ -18,7 +17,7 @@ from firmware_py.sensing.kinematics import observation_matrix
 from firmware_py.sensing.noise_file import noise_table
 from hal.bench import load_bench
 from hal.errors import BenchError
-from tools.cli.main import app
+from tests.command import micron
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"
 NAMES = [f"accelerometer_{axis}" for axis in AXES]
@@ -74,7 +73,7 @@ def test_from_a_recording_at_rest_to_the_firmware(tmp_path: Path) -> None:
     np.savez(tmp_path / "rest.npz", **columns)
     arguments = ["noise", str(tmp_path / "rest.npz"), "--rate-hz", "100", "--shortest-s", "0.1"]
     arguments += ["--json", str(tmp_path / "noise.json"), "--picture", str(tmp_path / "noise.png")]
-    result = CliRunner().invoke(app, arguments)
+    result = micron(*arguments)
     assert result.exit_code == 0, result.output
     sensing = load_plan(load_bench(bench_with(tmp_path, tmp_path / "noise.json"))).stages.sensing
     np.testing.assert_allclose(sensing.noise_ug_per_rtHz, n * np.sqrt(2.0) * 1e6 / 9.80665, rtol=0.05)
@@ -104,6 +103,6 @@ def test_a_bad_file_is_refused(tmp_path: Path, content: str, message: str) -> No
 def test_a_bench_with_a_bad_noise_file_ends_with_2(tmp_path: Path) -> None:
     bench = bench_with(tmp_path, tmp_path / "absent.json")
     np.savez(tmp_path / "rest.npz", **{f"analog_V_{i}": np.zeros(9) for i in range(8)})
-    result = CliRunner().invoke(app, ["noise", str(tmp_path / "rest.npz"), "--bench", str(bench)])
+    result = micron("noise", tmp_path / "rest.npz", "--bench", bench)
     assert result.exit_code == 2
     assert "absent.json" in result.output

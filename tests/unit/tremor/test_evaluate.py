@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from firmware_py.tremor.config import TremorConfig
-from tools.cli.main import app
+from tests.command import micron
 from tools.research.tremor.cases import emulated_hand
 from tools.research.tremor.evaluate import ORACLE, OTHERS, Result, evaluate, summarise
 from tools.research.tremor.manners import manners
@@ -53,7 +52,7 @@ def test_a_csv_in_micrometres(tmp_path: Path) -> None:
     file.write_text("t_s,x_um\n" + "\n".join(f"{a:.3f},{b:.4f}" for a, b in zip(t, x, strict=True)) + "\n")
     out, picture = tmp_path / "out.json", tmp_path / "out.png"
     arguments = ["tremor", "evaluate", str(file), "--method", "adaptive", "--horizons-ms", "2", "--json", str(out)]
-    done = CliRunner().invoke(app, [*arguments, "--png", str(picture)])
+    done = micron(*arguments, "--png", picture)
     assert done.exit_code == 0, done.output
     row = next(r for r in json.loads(out.read_text())["rows"] if r["method"] == "adaptive")
     assert row["lifted_percent"] < 15.0
@@ -71,6 +70,6 @@ def test_a_csv_in_micrometres(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_is_one_line_and_status_two(arguments: list[str], said: str) -> None:
-    done = CliRunner().invoke(app, ["tremor", "evaluate", *arguments])
+    done = micron("tremor", "evaluate", *arguments)
     assert done.exit_code == 2
     assert said in done.output

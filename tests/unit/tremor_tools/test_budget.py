@@ -6,12 +6,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
-from tools.cli.main import app
+from tests.command import micron
 from tools.reports.figures import FOUR_BANDS_HZ, TREMOR_BAND_HZ
 from tools.research.tremor import budget
 from tools.research.tremor.bench_variant import write_variant
@@ -39,7 +38,7 @@ def test_a_part_that_is_made_perfect_loses_its_calibration(tmp_path: Path, sourc
 
 
 def test_an_endoscope_has_no_budget_of_tremor() -> None:
-    result = CliRunner().invoke(app, ["tremor", "budget", "--bench", str(BENCH.with_name("endoscope.toml"))])
+    result = micron("tremor", "budget", "--bench", BENCH.with_name("endoscope.toml"))
     assert result.exit_code == 2
     assert "belongs to the instrument" in result.output
 

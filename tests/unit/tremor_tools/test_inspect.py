@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 from tools.research.tremor.inspect import Rule, inspect
 from tools.research.tremor.signal import TremorSignal
 from tools.research.tremor.signals import load_signals
@@ -93,7 +92,7 @@ def test_command_writes_json_picture_and_page(tmp_path: Path) -> None:
     file.write_text("t_s,x_um\n" + "\n".join(f"{t:.3f},{20 * np.sin(2 * np.pi * 9 * t):.4f}" for t in t_s))
     out = {kind: tmp_path / f"found.{kind}" for kind in ("json", "png", "html")}
     command = ["tremor", "inspect", str(file), "--json", str(out["json"]), "--png", str(out["png"])]
-    result = CliRunner().invoke(app, [*command, "--html", str(out["html"])])
+    result = micron(*command, "--html", out["html"])
     assert result.exit_code == 0, result.output
     (signal,) = json.loads(out["json"].read_text())["signals"]
     assert signal["peak_hz"] == pytest.approx(9.0, abs=0.01)
@@ -106,5 +105,5 @@ def test_command_writes_json_picture_and_page(tmp_path: Path) -> None:
 def test_command_refuses_bad_input(tmp_path: Path, extra: list[str]) -> None:
     file = tmp_path / "hand.csv"
     file.write_text("t_s,x_um\n" + "\n".join(f"{i / 100},{i % 7}" for i in range(900)))
-    result = CliRunner().invoke(app, ["tremor", "inspect", str(file), *extra])
+    result = micron("tremor", "inspect", file, *extra)
     assert result.exit_code == 2, result.output

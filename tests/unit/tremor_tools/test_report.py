@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from tools.cli.main import app
+from tests.command import micron
 from tools.errors import InputError
 from tools.research.reproduce.tremor_hands import PUBLISHED_CROSS
 from tools.research.tremor.cascade import Cascade
@@ -97,7 +96,7 @@ def test_train_command_writes_weights_that_run(tmp_path: Path) -> None:
     file.write_text("t_s,gyro_x_rad_s,gyro_y_rad_s\n" + rows)
     out, found = tmp_path / "net.json", tmp_path / "found.json"
     command = ["tremor", "train", str(file), "--window", "20", "--units", "0", "--out", str(out), "--json", str(found)]
-    result = CliRunner().invoke(app, command)
+    result = micron(*command)
     assert result.exit_code == 0, result.output
     (row,) = json.loads(found.read_text())["rows"]
     assert row["percent"] > 60.0
@@ -105,7 +104,7 @@ def test_train_command_writes_weights_that_run(tmp_path: Path) -> None:
     assert network.centred
     assert np.all(np.isfinite(Cascade(network).run(np.zeros(100))))
     again = tmp_path / "again.json"
-    tested = CliRunner().invoke(app, ["tremor", "train", str(file), "--weights", str(out), "--json", str(again)])
+    tested = micron("tremor", "train", file, "--weights", out, "--json", again)
     assert tested.exit_code == 0, tested.output
     assert json.loads(again.read_text())["rows"][0]["percent"] > 60.0
 
@@ -117,7 +116,7 @@ def test_train_command_refuses(tmp_path: Path, extra: list[str]) -> None:
     file.write_text(
         "t_s,gyro_x_rad_s\n" + "\n".join(f"{t:.5f},{v[0]:.5f}" for t, v in zip(made.t_s, made.values, strict=True))
     )
-    result = CliRunner().invoke(app, ["tremor", "train", str(file), "--out", str(tmp_path / "net.json"), *extra])
+    result = micron("tremor", "train", file, "--out", tmp_path / "net.json", *extra)
     assert result.exit_code == 2, result.output
     assert not (tmp_path / "net.json").exists()
 
@@ -135,6 +134,6 @@ def test_a_section_is_made_again_and_the_others_stay(tmp_path: Path, monkeypatch
     )
     with pytest.raises(InputError, match="no section '## Two'"):
         pages.renewed("# Page\n", "inspect", tmp_path, "abc", lambda _: None)
-    done = CliRunner().invoke(app, ["tremor", "report", "--section", "inspect", "--out", str(tmp_path / "no.md")])
+    done = micron("tremor", "report", "--section", "inspect", "--out", tmp_path / "no.md")
     assert done.exit_code == 2
     assert "--out FILE" in done.output

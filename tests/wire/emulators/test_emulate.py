@@ -20,12 +20,11 @@ import can
 import numpy as np
 import pytest
 import serial
-from typer.testing import CliRunner
 
 from hal.errors import BenchError
 from sim_devices.transports import i2c_shim
 from sim_devices.transports.i2c_shim import build_shim, number_buses
-from tools.cli.main import app
+from tests.command import micron
 
 HERE = Path(__file__).parent
 MICRON = [sys.executable, "-m", "tools.cli.main"]
@@ -289,7 +288,7 @@ def test_bad_input_is_one_message(words: tuple[str, ...], said: str, tmp_path: P
         places = {"folder": tmp_path, "busy": busy.getsockname()[1]}
         json_file = tmp_path / "out.json"
         command = ["emulate", "--json", str(json_file), *(word.format(**places) for word in words)]
-        result = CliRunner().invoke(app, command)
+        result = micron(*command)
     assert result.exit_code == 2
     assert said in result.stderr
     assert result.stderr.count("micron:") == 1
