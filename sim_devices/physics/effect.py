@@ -312,7 +312,7 @@ class Effect:
     """True if it changes a gain, a zero or a linear term alone: it has no place where the simulation's own are
     re-fitted."""
 
-    def shows_absence(self, name: str) -> bool:
+    def must_not_vanish(self, name: str) -> bool:
         """Return True if the human parameter ``name`` is one without which the effect is absent."""
         return not self.vanishes_with or any(fnmatchcase(name, q) for group in self.vanishes_with for q in group)
 

@@ -44,7 +44,7 @@ class Placed:
         if self.effect.report is None or self.parts.nonlinear:
             return np.ones(count, np.bool_)
         sizes = (self.effect.report(alone, self.settings, 1.0) for alone in np.eye(count))
-        return np.array([any(h.value for h in of if self.effect.shows_absence(h.name)) for of in sizes], np.bool_)
+        return np.array([any(h.value for h in of if self.effect.must_not_vanish(h.name)) for of in sizes], np.bool_)
 
     @property
     def label(self) -> str:

@@ -298,8 +298,8 @@ changes in the derivatives that neither the constant parameters nor another one 
 def _state_pairs(equations: Equations, x: Array, u: Array, values: Array, free: Sequence[int]) -> list[tuple[int, int]]:
     """Return (parameter, state): each parameter of a derivative, with a state that it may follow.
 
-    Left out is what changes the derivatives as constant parameters do (a resistance that follows the only current
-    beside a voltage), and of those that do the same all but the first.
+    Left out is what changes the derivatives as constant parameters do (a heating power that follows the temperature,
+    beside a loss in proportion to it), and of those that do the same all but the first.
     """
     at = np.linspace(0, x.shape[0] - 1, min(PAIRED, x.shape[0])).astype(int)
     some, beside = x[at], u[at]
