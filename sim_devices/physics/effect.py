@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Literal
 
 import numpy as np
@@ -295,6 +294,9 @@ class Effect:
     """
     estimated: tuple[str, ...] = ()
     """Those of ``limits`` that scatter with the noise: such a parameter is outside only where its 95 % interval is."""
+    weights_beside: Callable[[Settings], int] | None = None
+    """(settings) -> number of the last weights, which stand beside the effect (a curve without memory, a constant) and
+    alone do not show it. None: there are none."""
     essential: tuple[str, ...] = ()
     """Searched parameters that the effect needs: it is not named when one ends at its bound."""
     plain: str = ""
@@ -311,10 +313,6 @@ class Effect:
     shifts_line: bool = False
     """True if it changes a gain, a zero or a linear term alone: it has no place where the simulation's own are
     re-fitted."""
-
-    def must_not_vanish(self, name: str) -> bool:
-        """Return True if the human parameter ``name`` is one without which the effect is absent."""
-        return not self.vanishes_with or any(fnmatchcase(name, q) for group in self.vanishes_with for q in group)
 
     @property
     def is_linear(self) -> bool:

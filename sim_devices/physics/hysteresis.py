@@ -503,6 +503,7 @@ HYSTERESIS = Effect(
     basis=_basis,
     report=_report,
     variants=(_FORCE,),
+    weights_beside=lambda settings: CURVES if _form(settings) == "stops_curved" else 0,
     vanishes_with=(("loop_width_share",),),
     plain="backlash",
 )

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect, Parameter, Parts, Settings, Stage
 
@@ -34,17 +32,10 @@ class Placed:
         """Return the parameters of the effect."""
         return self.effect.parts(self.settings)
 
-    @cached_property
-    def showing(self) -> NDArray[np.bool_]:
-        """Return True for the weights (k,) that alone make a size without which the effect is absent.
-
-        A curve without memory or a constant that stands beside the effect does not.
-        """
-        count = len(self.parts.weights)
-        if self.effect.report is None or self.parts.nonlinear:
-            return np.ones(count, np.bool_)
-        sizes = (self.effect.report(alone, self.settings, 1.0) for alone in np.eye(count))
-        return np.array([any(h.value for h in of if self.effect.must_not_vanish(h.name)) for of in sizes], np.bool_)
+    @property
+    def weights_beside(self) -> int:
+        """Return the number of the last weights, which alone do not show the effect."""
+        return self.effect.weights_beside(self.settings) if self.effect.weights_beside is not None else 0
 
     @property
     def label(self) -> str:

@@ -62,9 +62,9 @@ def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsu
     stuck = tuple(n for n in placed.effect.essential if f"{placed.label}.{n}" in at_bound)
     if stuck:
         return Doubt(k, "at_limit", stuck)
-    own, _ = fitted.model.slices(k)
+    own, weights = fitted.model.slices(k)
     whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1
-    if whole and unsure.chance_of_none(k, int(np.sum(placed.showing))) < 0.05:
+    if whole and unsure.chance_of_none(k, weights.stop - weights.start - placed.weights_beside) < 0.05:
         return None
     absent = absent_groups(placed.effect, parameters)
     return Doubt(k, "holds_zero", tuple(dict.fromkeys(n for of in absent for n in of))) if absent else None

@@ -139,12 +139,12 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
         own, weights = fitted.model.slices(k)
         if own.start == own.stop:
             # all weights as one column: their matrix may be too nearly singular to be inverted
-            weights = np.arange(weights.start, weights.stop)[fitted.model.placed[k].showing]
+            weights = slice(weights.start, weights.stop - fitted.model.placed[k].weights_beside)
             v = fitted.theta[weights]
             if not np.any(v):
                 whole[k] = np.inf
                 continue
-            others = np.delete(np.arange(size.size), weights)
+            others = np.delete(np.arange(size.size), np.arange(weights.start, weights.stop))
             column = j[:, weights] @ v
             norm = max(float(np.linalg.norm(column)), 1e-150)
             joined = np.column_stack([j[:, others] / size[others], column / norm])
