@@ -76,9 +76,9 @@ def test_an_effect_that_is_not_there_is_not_named_though_a_search_took_it(name: 
 
 
 def test_a_set_pays_for_the_choice_of_its_places() -> None:
-    """A dead zone at the input or at the output of one axis has two places, a spring that hardens one."""
+    """A dead zone at the input or at the output of one axis has two places, friction in several forms has one."""
     problem, _, base = prepared(stage(3), 0.3, 0, False)
-    effects = [EFFECTS["dead_zone"], EFFECTS["quadratic_drag"]]
+    effects = [EFFECTS["dead_zone"], EFFECTS["coulomb_friction"]]
     store = Store(problem, base, learned(), effects)
     with np.errstate(all="ignore"):
         sets = [store.with_one(store.base, places(problem, [e], ())[0]) for e in effects]

@@ -150,11 +150,12 @@ class Store:
     def choices_of(self, name: str) -> float:
         """Return the nats that tell the place of an effect among all that this problem has for it.
 
-        Of two descriptions that predict as well, the one that had fewer chances to do so is the more likely.
+        Of two descriptions that predict as well, the one that had fewer chances to do so is the more likely. Forms at
+        one place are no chances: they predict alike.
         """
         if name not in self._choices:
             own = [e for e in self.effects if e.name == name]
-            self._choices[name] = float(np.log(max(len(places(self.problem, own, ())), 1)))
+            self._choices[name] = float(np.log(max(len({p.label for p in places(self.problem, own, ())}), 1)))
         return self._choices[name]
 
     def lawful(self, predictable: float) -> bool:
