@@ -22,6 +22,8 @@ LOW_PASS_HZ = 20.0
 """Corner of the filter in front of the derivatives; it acts on the force as well."""
 SLOW_m_s = 3e-3
 """Speed below which friction may stick: such samples are left out."""
+WITHIN = 0.02
+"""What another filter may change of a constant. It was set after a look at ours, of which the worst is off by 1.3 %."""
 EDGE = 100
 """Samples at both ends, where the filter still settles."""
 
@@ -63,12 +65,12 @@ def table() -> Table:
             SOURCE,
             name,
             unit,
-            "first record, another filter",
+            f"first record, another filter, within {100 * WITHIN:.0f} %",
             was,
             ours,
             "equal",
             "recording",
-            tolerance=0.02 * abs(was),
+            tolerance=WITHIN * abs(was),
         )
         for name, unit, was, ours in zip(
             ("mass", "viscous friction", "Coulomb friction", "constant force"),
