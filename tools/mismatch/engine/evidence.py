@@ -55,16 +55,17 @@ def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> l
 def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsure: Uncertainty) -> Doubt | None:
     """Return why effect ``k`` of a model may not be named; None if it may.
 
-    An effect that has only weights is significant if they are not jointly zero: one that is correlated with a base
-    parameter is certain as a whole and uncertain in every figure.
+    An effect that several weights show, and no searched parameter, is significant if they are not jointly zero: one
+    that is correlated with a base parameter is certain as a whole and uncertain in every figure.
     """
     placed, at_bound = fitted.model.placed[k], fitted.at_bound
     stuck = tuple(n for n in placed.effect.essential if f"{placed.label}.{n}" in at_bound)
     if stuck:
         return Doubt(k, "at_limit", stuck)
     own, weights = fitted.model.slices(k)
-    whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1
-    if whole and unsure.chance_of_none(k, weights.stop - weights.start - placed.weights_beside) < 0.05:
+    showing = weights.stop - weights.start - placed.weights_beside
+    whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1 and showing > 1
+    if whole and unsure.chance_of_none(k, showing) < 0.05:
         return None
     absent = absent_groups(placed.effect, parameters)
     return Doubt(k, "holds_zero", tuple(dict.fromkeys(n for of in absent for n in of))) if absent else None
