@@ -17,6 +17,7 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.memo import Start
 
 
 def test_a_start_that_nobody_knows_is_set_by_the_first_samples(tmp_path: Path) -> None:
@@ -129,6 +130,26 @@ def test_a_stretch_in_which_a_body_sticks_is_met(tmp_path: Path) -> None:
     view = View(recording, tuple((a, a + 100) for a in range(0, 1200, 100)), 20, afresh=True)
     left = model.residual(view, theta)["angle"]
     assert np.sqrt(np.mean(left**2)) < 1.2 * 2e-3
+
+
+def test_linear_equations_know_how_their_starts_act_without_a_run_each(tmp_path: Path) -> None:
+    """The same equations with a force of no size have no exact steps, and take differences of runs."""
+    recording, _ = noisy_motor(tmp_path)
+    twin = make(recording)
+    (place,) = sites(twin, recording, EFFECTS["gravity_load"])
+    plain, forced = Model(twin), Model(twin, [place])
+
+    def starts(model: Model) -> Start:
+        view = View(recording, ((0, 200), (220, 600)), 40, afresh=True).near()
+        model.simulate(view, model.start(recording))
+        assert view.nearby is not None
+        (found,) = view.nearby.of_stretches.values()
+        return found
+
+    exact, by_runs = starts(plain), starts(forced)
+    assert exact.x0 == pytest.approx(by_runs.x0, abs=2e-3)
+    assert exact.states == pytest.approx(by_runs.states, abs=1e-3 * np.max(np.abs(exact.states)))
+    assert exact.slopes == pytest.approx(by_runs.slopes, abs=1e-3 * np.max(np.abs(exact.slopes)))
 
 
 def test_runs_of_one_search_start_near_each_other(tmp_path: Path) -> None:

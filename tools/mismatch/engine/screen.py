@@ -17,7 +17,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
-from tools.mismatch.twins.memo import Nearby
+from tools.mismatch.twins.memo import Nearby, stored
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Ground:
     searched parameter of the current model there (``bends[o]`` (rows, k)); and the energy of each output when
     everything free is regressed out. For a model of many parameters (``is_wide``) it also has the derivatives with
     respect to the linear ones that move an output: their places in ``model.linear``, and (rows, places). ``nearby``:
-    the start states of the current model, near which candidates start.
+    the start states of the current model, near which candidates start on the same base.
     """
 
     rows: NDArray[np.int64]
@@ -99,6 +99,8 @@ OWN_SHARE = 0.05  # least share of the residual of the engineer's base that an e
 
 
 STEP = 1e-3  # of a parameter, for its sensitivities
+LEAST_P = 1e-3
+"""Largest p-value of an effect's own test at which it may be named."""
 
 
 def bend(problem: Problem, current: Fit, step: float = STEP) -> Ground:
@@ -154,7 +156,8 @@ def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> C
         full[index] = current.residual[o][problem.row_of_sample[index]]
         signature = placed.effect.test(x, full, ctx)
         share, p_value, tested = signature.share, signature.p_value, True
-    for start in begin[:6]:
+    refused = tested and p_value > LEAST_P
+    for start in () if refused else begin[:6]:
         gained, p = _step_gain(problem, current, model, start, ground)
         share = max(share, gained)
         if not tested:
@@ -186,18 +189,18 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     """Return (explained share of the mean square, p-value of the F test) of one linear step from ``theta``."""
     outputs = model.together(model.placed[-1].outputs)
     rows = ground.rows
-    same_base = np.array_equal(theta[: model.n_base], current.theta[: model.n_base])
-    view = problem.view.near(ground.nearby if same_base else None)
+    base = current.theta.copy()
+    base[: model.n_base] = theta[: model.n_base]
+    elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
+    nearby = _starts_on(problem, current, base) if elsewhere_based else ground.nearby
+    view = problem.view.near(nearby)
     design = model.design(view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
     # the design at these parameters contains the simulation
     moved = {o: design.constant[o] + design.columns[o] @ theta[list(design.linear[o])] for o in outputs}
     # a start on another base is compared with that base without the effect, whose gain is not the effect's share
-    base = current.theta.copy()
-    base[: model.n_base] = theta[: model.n_base]
-    elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
-    without = current.model.simulate(problem.view, base, outputs) if elsewhere_based else None
+    without = current.model.simulate(problem.view.near(nearby), base, outputs) if elsewhere_based else None
     pushed: list[dict[str, Array]] = []
     for j in new_weights:
         other = theta.copy()
@@ -253,6 +256,19 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     # the gain of another base by itself is not the effect's
     share = 1 - after / (before_ if null - after > OWN_SHARE * null else null)
     return max(0.0, share), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
+
+
+def _starts_on(problem: Problem, current: Fit, theta: Array) -> Nearby:
+    """Return the start states of the current model on another base, near which its candidates start there."""
+    key = ("starts on", current.model.key, theta.tobytes())
+    known = problem.view.memo.get(key)
+    if isinstance(known, Nearby):
+        return known
+    view = problem.view.near()
+    assert view.nearby is not None
+    current.model.simulate(view, theta)
+    stored(problem.view.memo, key, view.nearby, view.nearby.nbytes)
+    return view.nearby
 
 
 def _is_weight(model: Model, j: int) -> bool:

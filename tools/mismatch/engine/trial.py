@@ -12,7 +12,7 @@ from tools.mismatch.engine.fit import ROUGH, Fit, fit
 from tools.mismatch.engine.linearised import fit_beside
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, compare, misfits
-from tools.mismatch.engine.screen import Candidate, Ground, bend, is_wide, one_step
+from tools.mismatch.engine.screen import LEAST_P, Candidate, Ground, bend, is_wide, one_step
 from tools.mismatch.engine.vary import with_balance
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
@@ -26,7 +26,6 @@ LEAST_FITS = 3  # number of candidates per output that are fitted independent of
 MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
-LEAST_P = 1e-3
 TRIAL_ROWS = 12_000  # number of rows, over all outputs, of a candidate's fit; accepted ones are fitted on every row
 
 
@@ -71,10 +70,10 @@ class Trial:
     def name(self) -> str:
         return self.placed.effect.name
 
-    @property
-    def refused(self) -> bool:
-        """Return True if the effect's own test is negative: then no fit, alone or with others, makes it a name."""
-        return self.candidate.tested and self.candidate.p_value > LEAST_P
+
+def is_refused(c: Candidate) -> bool:
+    """Return True if the effect's own test is negative: then no fit, alone or with others, makes it a name."""
+    return c.tested and c.p_value > LEAST_P
 
 
 def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Array]:
@@ -142,7 +141,7 @@ def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int 
     Specific effects, flexible families (which one step overestimates) and events or noise with a test of their own are
     ranked separately (of each ``least``, and up to ``most`` that are near the best). Those inside the equations have a
     rank of their own as well: one step underestimates an outflow beside which the base moves far. Candidates that are
-    clear by their own test are added. Forms of an effect share one rank.
+    clear by their own test are added, and those that it refuses are not fitted. Forms of an effect share one rank.
     """
     keep = [False] * len(candidates)
     outputs = sorted({o for c in candidates for o in c.placed.outputs})
@@ -151,7 +150,9 @@ def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int 
     for o in outputs:
         for kind in ("specific", "flexible", "tested", "inside"):
             of = inside if kind == "inside" else kinds
-            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and of[i] == kind]
+            here = [
+                i for i, c in enumerate(candidates) if o in c.placed.outputs and of[i] == kind and not is_refused(c)
+            ]
             here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
             top = candidates[here[0]].share if here else 0.0
             names = list(dict.fromkeys(candidates[i].placed.effect.name for i in here))

@@ -288,7 +288,7 @@ class Search:
             part = part_of(t.placed)
             if part not in self.store.seen or t.candidate.share > self.store.seen[part].share:
                 self.store.seen[part] = t.candidate
-            if t.fitted is not None and not t.refused:
+            if t.fitted is not None:
                 children.append((self.store.put(t.fitted), t.placed))
         if self.store.problem.twin.apart and len(self.store.problem.twin.outputs) > 1:
             self.spread(s, children)

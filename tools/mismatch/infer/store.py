@@ -17,8 +17,7 @@ from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import compare
-from tools.mismatch.engine.screen import Candidate, bend, one_step, places
-from tools.mismatch.engine.trial import LEAST_P
+from tools.mismatch.engine.screen import LEAST_P, Candidate, bend, one_step, places
 from tools.mismatch.engine.unexplained import led_by
 from tools.mismatch.engine.vary import added, beyond_limits, size, stripped, with_balance
 from tools.mismatch.infer.constants import Constants

@@ -57,6 +57,10 @@ class Nearby:
 
     of_stretches: dict[bytes, Start] = field(default_factory=dict[bytes, Start])
 
+    @property
+    def nbytes(self) -> int:
+        return sum(s.x0.nbytes + s.states.nbytes + s.slopes.nbytes for s in self.of_stretches.values())
+
     def copy(self) -> Nearby:
         """Return the same starts for another search, which may add its own."""
         return Nearby(dict(self.of_stretches))

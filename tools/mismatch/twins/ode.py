@@ -411,18 +411,25 @@ class OdeTwin(Head):
         x0 = remember(run.lasting, ("about", run.starts), plain)
         x0 = np.where(np.isfinite(x0), x0, given)
         reading = remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
+        weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
+        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
+        first = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
+        every_sample = run.setting if self.integrates else None
+        seen = first if every_sample is None else every_sample
         if steps is not None and self.reads_affine and all(p.is_linear for p in run.paths.values()):
             x = steps.run(x0, u, starts, ends)
             y = self.equations.readings(x, u, run.t, values)
             rows = dict(zip(self.outputs, reading, strict=True))
             ss = start_state(steps.ad, rows, run if self.integrates else replace(run, setting=None))
             missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
-            return x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
-        weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
-        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
-        first = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
-        every_sample = run.setting if self.integrates else None
-        seen = first if every_sample is None else every_sample
+            x = x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
+            if run.nearby is not None and not run.paths:
+                pushes = self.typical * np.eye(self.typical.size)
+                moved = [np.repeat(push[None, :], starts.size, axis=0) for push in pushes]
+                states = np.stack([run_pushed(steps.ad, np.zeros(x.shape), x0, starts, ends) for x0 in moved], axis=-1)
+                slopes = np.einsum("qi,nij->nqj", weight[:, None] * reading, states[seen])
+                run.nearby.of_stretches.setdefault(starts.tobytes(), Start(x[starts], states, slopes))
+            return x
         used, rows = np.unique(np.searchsorted(starts, seen, side="right") - 1, return_inverse=True)
         edges = edges_of(rows, used.size)
         every = np.arange(run.t.size)
