@@ -23,6 +23,8 @@ from tools.mismatch.recording_load import load
         ("sensor_left", ("sensor_left", "")), ("T/degC", ("T", "degC")),
         ("speed_rad_s", ("speed", "rad/s")), ("a_m_s2", ("a", "m/s2")), ("sun_W_m2", ("sun", "W/m2")),
         ("wheel_l", ("wheel_l", "")), ("tank_ml", ("tank", "ml")), ("speed_in_s", ("speed_in", "s")),
+        ("dilution_1_h", ("dilution", "1/h")), ("feed_g_l", ("feed", "g/l")), ("flow_l_min", ("flow", "l/min")),
+        ("charge_A_h", ("charge", "Ah")), ("x_V_min", ("x_V_min", "")), ("pump_1_s", ("pump_1", "s")),
     ],
 )  # fmt: skip
 def test_units_are_read_from_names(name: str, parts: tuple[str, str]):

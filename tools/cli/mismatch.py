@@ -259,16 +259,19 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
     console().print(f"next: write what you know into {path}, then: micron mismatch diagnose {path}", soft_wrap=True)
 
 
-def physics(json_file: JsonOption = None) -> None:
-    """List every effect of the vocabulary with formula, parameters, source, and the excitation that shows it.
+def physics(
+    names: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Effects to print; default: all.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """List the effects of the vocabulary with formula, parameters, source, and the excitation that shows them.
 
-    Example: micron mismatch physics --json -
+    Example: micron mismatch physics creep backlash
     """
     with clear_errors():
         check_writable(json_file)
         from tools.mismatch.report.vocabulary import entries, print_vocabulary, to_json
 
-        effects = entries()
+        effects = entries(names or ())
         if json_file != "-":
             print_vocabulary(effects, data_console())
         write_json(to_json(effects), json_file)

@@ -17,8 +17,11 @@ Fits = Callable[[str, str, str, tuple[str, ...]], bool]
 _SUFFIX = re.compile(
     r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
 )
-_QUOTIENT = re.compile(r"^(?P<name>.+?)_(?P<over>[^\W\d_]+)_(?P<under>s2?|m2)$")
-"""A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``."""
+_QUOTIENT = re.compile(
+    r"^(?P<name>.+?)_(?:(?P<over>1(?=_h$)|[^\W\d_]+)_(?P<under>s2?|m2|h|[lL])|(?P<amount>m?[lL]|k?g|m?mol|m3)_(?P<per>min))$"
+)
+"""A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``, ``feed_g_l``. A
+minute only under an amount, because ``x_V_min`` is a smallest voltage."""
 _SPOKEN = {"mps": "m/s", "mps2": "m/s^2", "radps": "rad/s", "radps2": "rad/s^2"}
 """Units as names of columns spell them."""
 _ORDINARY_WORDS = ("in", "ft", "min", "h", "l", "L", "F", "H")
@@ -57,11 +60,11 @@ def split_unit(name: str) -> tuple[str, str]:
     """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
     quotient = _QUOTIENT.match(name.strip())
     if quotient is not None and quotient["over"] != "in":
-        try:
-            units.parse(quotient["over"])
-            return quotient["name"], f"{quotient['over']}/{quotient['under']}"
-        except units.UnitError:
-            pass
+        over, under = quotient["over"] or quotient["amount"], quotient["under"] or quotient["per"]
+        # ampere hours and watt hours are products
+        unit = f"{over}h" if under == "h" and over[-1] in "AW" else f"{over}/{under}"
+        if units.is_unit(unit):
+            return quotient["name"], unit
     found = _SUFFIX.match(name.strip())
     if found is None:
         return name.strip(), ""

@@ -69,7 +69,12 @@ TWIN = (
     Key("kind", "text", "one of the kinds below"),
     Key("parameters", "table", "what you believe of the twin; below, per kind", "estimated where possible"),
     Key("effects", "list of tables", "effects of a corrected twin; written by 'micron mismatch apply'", "none"),
-    Key("file", "file name", "a twin file instead of all the keys above, relative to the recording", "none"),
+    Key(
+        "file",
+        "file name",
+        "a file with a [twin] table, instead of all the keys above; relative to the recording",
+        "none",
+    ),
 )
 HOLD = Key(
     "hold",

@@ -248,12 +248,10 @@ def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
     effects = value.get("effects", [])
     if not isinstance(parameters, Mapping):
         raise RecordingError(f"{where}: [twin.parameters] must be a table")
-    if kind == "state_space" and "states" in value:
-        parameters = {**parameters, "states": value["states"]}
-    if kind != "ode":
-        refuse_unknown_keys(f"{where}: [twin]", value, (*TWIN_KEYS, *(["states"] if kind == "state_space" else [])))
-    else:
-        parameters = {**parameters, **{k: v for k, v in value.items() if k not in ("kind", "parameters", "effects")}}
+    beside = {k: v for k, v in value.items() if k not in TWIN_KEYS}
+    for key in beside.keys() & parameters.keys():
+        raise RecordingError(f"{where}: '{key}' stands in [twin] and in [twin.parameters]; leave one of them out")
+    parameters = {**parameters, **beside}
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise RecordingError(f"{where}: [[twin.effects]] must be tables")
     return TwinText(kind, dict(parameters), tuple(effects)), words

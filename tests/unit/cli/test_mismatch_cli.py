@@ -227,6 +227,16 @@ def test_physics_names_the_contract_s_vocabulary():
     assert "hysteresis  rate-independent memory" in run("physics").stdout
 
 
+def test_physics_prints_the_named_effects_alone():
+    text = run("physics", "overflow", "creep").stdout
+    assert [line.split()[0] for line in text.splitlines() if line[:1].isalpha()][:2] == ["creep", "overflow"]
+    assert "backlash  free play" not in text
+    assert " ".join(text.split()).count("where adds a flow of what a state stores") == 1
+    result = run("physics", "creap")
+    assert result.exit_code == 2
+    assert "no effect 'creap'; write 'creep'" in result.stderr
+
+
 def test_prove_prints_its_table_and_writes_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     asked = {}
 

@@ -224,7 +224,7 @@ def test_the_page_says_what_a_stranger_asks() -> None:
     for signal, needed in {"temperature": "temperature_sensitivity", "current": "current_coupling"}.items():
         assert f"| `{signal}` | {CONTEXT_UNITS[signal][0]} | `{needed}` |" in text
     assert f"{recording_load.MIN_SAMPLES} samples are needed" in text
-    assert "`units` may stand there or, as here, in `[twin]`" in text.replace("\n", " ")
+    assert "or, as `states` and `equations` here, in `[twin]`" in text.replace("\n", " ")
     assert all(f"| `{name}` |" in text for name in EFFECTS)
 
 

@@ -71,3 +71,16 @@ def test_a_hold_is_printed_for_kinds_that_have_one(tmp_path: Path) -> None:
     assert "inputs: simulated_x (mm)" in lines
     lines = as_read(load(_recorded(tmp_path, SLIDING, 0.0)))
     assert "inputs: force (N, hold not given)" in lines
+
+
+def test_the_parameters_are_printed_as_they_were_read(tmp_path: Path) -> None:
+    assert "parameters: mass = 1" in as_read(load(_recorded(tmp_path, SLIDING, 0.0)))
+
+
+def test_a_simulation_that_is_further_off_than_the_mean_is_said_to_be(tmp_path: Path) -> None:
+    line, row = _simulated(_recorded(tmp_path, COLUMNS, 50.0))
+    assert row["share"] > 1.0
+    assert line.endswith("its mean alone would be closer; check units, signs and offsets")
+    line, row = _simulated(_recorded(tmp_path, COLUMNS, 0.001))
+    assert row["share"] < 1.0
+    assert "closer" not in line

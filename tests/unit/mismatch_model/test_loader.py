@@ -51,6 +51,11 @@ def test_csv_is_converted(tmp_path: Path) -> None:
     assert dict(r.twin.parameters) == {"gain_um_per_V": 0.125}
 
 
+def test_the_keys_of_a_kind_may_stand_beside_it(tmp_path: Path) -> None:
+    text = GOOD.replace("[twin.parameters]\n", 'hold = "zero"\n')
+    assert dict(load(write(tmp_path, text)).twin.parameters) == {"gain_um_per_V": 0.125, "hold": "zero"}
+
+
 def test_npz_and_time_column(tmp_path: Path) -> None:
     t = 5.0 + np.arange(100) * 0.01
     np.savez(tmp_path / "d.npz", t_s=t, command_mV=np.arange(100), z=np.arange(100) * 2.0, temp=t)

@@ -100,10 +100,10 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
         None,
         r"\[\[channels\]\] 2: key 'noise_rsm' is unknown; write 'noise_rms'",
     ),
-    "parameter beside its table": (
+    "parameter in both tables": (
         GOOD.replace('"piezo_stack"', '"piezo_stack"\ngain_um_per_V = 2.0'),
         None,
-        r"\[twin\] key 'gain_um_per_V' is unknown; leave it out\. Known keys: kind, parameters",
+        r"'gain_um_per_V' stands in \[twin\] and in \[twin.parameters\]; leave one of them out",
     ),
     "misspelt key of the split": (
         SPLIT + "tets = [300, 400]",

@@ -55,7 +55,10 @@ class Residual:
         line = f"{self.output}: residual {self.rms:.4g} {self.unit} rms{self.where}"
         if self.scatter < LEAST_OFFSET * self.rms:
             line += f" ({self.scatter:.4g} {self.unit} about its mean of {self.mean:.4g} {self.unit})"
-        return line if self.share is None else f"{line}, {percent(self.share)} of the recording's standard deviation"
+        if self.share is None:
+            return line
+        line += f", {percent(self.share)} of the recording's standard deviation"
+        return line if self.share <= 1.0 else f"{line}: its mean alone would be closer; check units, signs and offsets"
 
 
 def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
@@ -75,7 +78,9 @@ def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual
 
 
 def as_read(recording: Recording) -> list[str]:
-    """Return what was read of a recording, as lines: twin, clock, signals, holds where its kind has one, notes."""
+    """Return what was read of a recording, as lines: twin, clock, signals, holds where its kind has one, parameters,
+    notes.
+    """
     holds = declared_holds(recording)
     has_hold = "hold" in names(PARAMETERS.get(recording.twin.kind, ()))
     named = lambda of: ", ".join(f"{s} ({recording.file_unit[s]})" for s in of)  # noqa: E731
@@ -90,6 +95,11 @@ def as_read(recording: Recording) -> list[str]:
     ]
     if recording.context:
         lines.append(f"other signals: {named(recording.context)}")
+    given = {
+        k: v for k, v in recording.twin.parameters.items() if isinstance(v, int | float) and not isinstance(v, bool)
+    }
+    if given:
+        lines.append("parameters: " + ", ".join(f"{k} = {v:.6g}" for k, v in given.items()))
     return [*lines, *(f"note: {note}" for note in recording.warnings)]
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,16 @@ from rich.text import Text
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context, Effect
+from tools.errors import InputError
 from tools.mismatch.engine.unexplained import about
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.wording import words
 from tools.terminal import pairs_of
 
-UNITS = "units: {in} and {out} are those of the twin's input and output"
+UNITS = (
+    "units: {in} and {out} are those of the twin's input and output; of what acts inside the equations, "
+    "{out} is that of the state. Temperatures of a fourth power are absolute, also where a state is in degC"
+)
 
 
 @dataclass(frozen=True)
@@ -42,13 +47,30 @@ _ACTS = {
     "add": "adds to the signal",
     "linear": "filters the signal",
     "nonlinear": "maps the signal",
-    "feedback": "a force or flow inside the equations",
+}
+_INSIDE = {
+    "motion": "adds a force on a body",
+    "joint": "adds a force between two bodies",
+    "storage": "adds a flow of what a state stores",
+    "storages": "adds a flow of what a state stores",
+    "state": "changes a parameter of the equations",
+    "parameter": "changes a parameter of the equations",
+    "direction": "changes a parameter of the equations",
 }
 
 
-def entries() -> list[Entry]:
-    """Return every effect, in the contract's order."""
-    return [_entry(e) for e in EFFECTS.values()]
+def _acts(effect: Effect) -> list[str]:
+    return [_INSIDE[a] for a in effect.acts_on] if effect.kind == "feedback" else [_ACTS[effect.kind]]
+
+
+def entries(names: Collection[str] = ()) -> list[Entry]:
+    """Return the effects ``names``, or all, in the contract's order. Raises InputError for an unknown one."""
+    for name in names:
+        if name not in EFFECTS:
+            similar = get_close_matches(name, EFFECTS, 1)
+            advice = f"write '{similar[0]}'" if similar else "'micron mismatch physics' lists them"
+            raise InputError(f"no effect '{name}'; {advice}")
+    return [_entry(e) for e in EFFECTS.values() if not names or e.name in names]
 
 
 def _entry(effect: Effect) -> Entry:
@@ -57,7 +79,7 @@ def _entry(effect: Effect) -> Entry:
         effect.name,
         effect.summary,
         tuple(effect.stages),
-        "; ".join(dict.fromkeys(_ACTS[f.kind] for f in forms)),
+        "; ".join(dict.fromkeys(a for f in forms for a in _acts(f))),
         tuple(dict.fromkeys(f.equation for f in forms)),
         _parameters(effect),
         effect.source,
@@ -115,7 +137,10 @@ def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
         console.print(Text.assemble((e.name, "bold yellow"), "  ", e.summary))
         rows = [("formula", "\n".join(map(plain, e.equations)))]
         rows.append(("parameters", ", ".join(f"{n} ({u})" if u != "1" else n for n, u in e.parameters)))
-        rows.append(("where", f"{', '.join(e.stages)}; {e.acts}"))
+        # the stages are those of a chain of signals, and what acts inside the equations alone has none
+        rows.append(
+            ("where", f"{', '.join(e.stages)}; {e.acts}" if set(_ACTS.values()) & set(e.acts.split("; ")) else e.acts)
+        )
         rows.append(("shown by", e.excitation))
         if e.needs:
             rows.append(("needs", f"recorded {' or '.join(e.needs)}"))

@@ -111,9 +111,9 @@ Where inputs of a `mechanical_axis`, a `state_space` or an `ode` differ, give ea
 `hold = { command = "zero", temperature = "linear" }`.
 
 Your own equations are text, or a Python function. An output that has the name of a state is converted to the state's
-unit; one with an equation of its own has the unit of its column. The engine tries
-[what can be named](#what-can-be-named) at inputs and outputs, at every state, and between two bodies that a spring
-joins:
+unit; one with an equation of its own has the unit of its column (for a column in mm write millimetres). The engine
+tries [what can be named](#what-can-be-named) at inputs and outputs, at every state, and between two bodies that a
+spring joins:
 
 ``` { .toml title="a fan, in place of the [twin] above" }
 [twin]
@@ -133,8 +133,7 @@ fixed = ["inertia"]      # the data show only ratios of the three, so one must b
 hold = "zero"
 ```
 
-The keys of a kind stand in `[twin.parameters]`. Of an `ode` the tables `states`, `equations`, `outputs`, `offsets` and
-`units` may stand there or, as here, in `[twin]`; so may the `states` of a `state_space`.
+The keys of a kind stand in `[twin.parameters]` or, as `states` and `equations` here, in `[twin]`.
 
 {equations}
 
@@ -162,8 +161,8 @@ taken, with a note. The equation of an encoder's output holds its counts:
 `mechanical_axis` with the input `torque` turns; with `force` it slides.
 
 A `columns` twin is a column of simulated output. It is an input, and `simulated_` stands before the output's name;
-`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`. Only scale and offset are re-fitted: a wrong time constant
-appears as an effect.
+`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`. It serves for a curve or transfer function of your own, too.
+Only scale and offset are re-fitted: a wrong time constant appears as an effect.
 
 ``` { .toml title="columns" }
 [[channels]]
