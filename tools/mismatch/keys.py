@@ -161,9 +161,13 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
                 "a unit, or a table: unit (an output of that name is converted to it), start, min, max; start (0 if"
                 " left out) is a first guess at which the equations are finite: the first samples override it, also"
                 " where you give it, as far as the outputs show the state",
+                "none: outputs are a curve of the inputs",
             ),
             Key(
-                "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
+                "equations",
+                "table of texts",
+                "the derivative of each state in terms of states, inputs and parameters",
+                "none, if there is no state",
             ),
             Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
             Key(

@@ -27,6 +27,8 @@ TOP_KEYS = (
     "format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions",
 )  # fmt: skip
 TWIN_KEYS = ("kind", "parameters", "effects", "file")
+STANDS_STILL: Mapping[str, Any] = {"states": {"no_state": "1"}, "equations": {"no_state": "-no_state"}}
+"""Equations of a curve, whose outputs follow the inputs at once: its one state stays at zero."""
 """Keys of ``[twin]`` for every kind; those of an ode's parameters may stand there, too."""
 
 
@@ -252,6 +254,8 @@ def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
     for key in beside.keys() & parameters.keys():
         raise RecordingError(f"{where}: '{key}' stands in [twin] and in [twin.parameters]; leave one of them out")
     parameters = {**parameters, **beside}
+    if kind == "ode" and "outputs" in parameters and not {"states", "equations", "function"} & set(parameters):
+        parameters |= STANDS_STILL
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise RecordingError(f"{where}: [[twin.effects]] must be tables")
     return TwinText(kind, dict(parameters), tuple(effects)), words

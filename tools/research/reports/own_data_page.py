@@ -133,7 +133,8 @@ fixed = ["inertia"]      # the data show only ratios of the three, so one must b
 hold = "zero"
 ```
 
-The keys of a kind stand in `[twin.parameters]` or, as `states` and `equations` here, in `[twin]`.
+The keys of a kind stand in `[twin.parameters]` or, as `states` and `equations` here, in `[twin]`. A curve has no states:
+give `outputs = { flow = "a * sqrt(pressure)" }` and `a` alone.
 
 {equations}
 
@@ -161,7 +162,7 @@ taken, with a note. The equation of an encoder's output holds its counts:
 `mechanical_axis` with the input `torque` turns; with `force` it slides.
 
 A `columns` twin is a column of simulated output. It is an input, and `simulated_` stands before the output's name;
-`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`. It serves for a curve or transfer function of your own, too.
+`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`.
 Only scale and offset are re-fitted: a wrong time constant appears as an effect.
 
 ``` { .toml title="columns" }

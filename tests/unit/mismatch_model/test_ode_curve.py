@@ -1,0 +1,78 @@
+"""A curve of one's own: equations without a state, whose outputs follow the inputs at once."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.recording_text import channel
+from tools.errors import RecordingError
+from tools.mismatch.apply import corrected_twin
+from tools.mismatch.export.run import simulate_file, simulate_own
+from tools.mismatch.export.write import write_twin
+from tools.mismatch.infer import diagnose
+from tools.mismatch.recording_load import load
+from tools.numbers import rms
+
+RATE_HZ = 100.0
+CURVE = (
+    """
+format = 1
+data = "data.csv"
+rate_hz = 100.0
+[twin]
+kind = "ode"
+hold = "linear"
+[twin.outputs]
+flow = "a * sqrt(max(pressure, 0) + b)"
+[twin.parameters]
+a = 1.8
+b = 0.1
+"""
+    + channel("pressure", "input", "pressure", "kPa")
+    + channel("flow", "output", "flow", "l/min")
+)
+
+
+def recorded(folder: Path, lag_s: float, text: str = CURVE) -> Path:
+    t = np.arange(1500) / RATE_HZ
+    p = 2.5 + 2.2 * np.sin(2 * np.pi * 0.31 * t) * np.cos(2 * np.pi * 0.05 * t) + 0.2 * np.sin(2 * np.pi * 1.7 * t)
+    now = 1.9 * np.sqrt(np.maximum(p, 0.0) + 0.1)
+    flow = now.copy()
+    for k in range(1, t.size if lag_s else 0):
+        flow[k] = flow[k - 1] + (now[k] - flow[k - 1]) * (1.0 - np.exp(-1.0 / RATE_HZ / lag_s))
+    flow += 0.01 * np.random.default_rng(5).standard_normal(t.size)
+    np.savetxt(folder / "data.csv", np.c_[p, flow], delimiter=",", header="pressure,flow", comments="")
+    (folder / "recording.toml").write_text(text)
+    return folder
+
+
+def test_a_curve_follows_its_input_at_once(tmp_path: Path) -> None:
+    recording = load(recorded(tmp_path, 0.0))
+    p = recording.inputs["pressure"]
+    assert simulate_own(recording)["flow"] == pytest.approx(1.8 * np.sqrt(np.maximum(p, 0.0) + 0.1), abs=1e-9)
+
+
+def test_what_is_missing_behind_a_curve_is_named_and_the_corrected_curve_runs_elsewhere(tmp_path: Path) -> None:
+    path = recorded(tmp_path, 0.15)
+    recording = load(path)
+    report = diagnose(recording, jobs=1, effects=[EFFECTS["first_order_lag"], EFFECTS["creep"]])
+    assert [p.name for p in report.physics] == ["first_order_lag"]
+    # the generator holds its input over a sample, where the twin's runs straight: half a sample more
+    assert report.physics[0].parameters["time_constant_s"].value == pytest.approx(0.15 - 0.5 / RATE_HZ, abs=3e-3)
+    twin = corrected_twin(path, report.to_json())
+    write_twin(twin, report.to_json(), tmp_path / "twin.py")
+    write_twin(twin, report.to_json(), tmp_path / "twin.toml")
+    flow = runpy.run_path(str(tmp_path / "twin.py"))["simulate"]({"pressure": recording.inputs["pressure"]})["flow"]
+    assert flow == pytest.approx(simulate_file(tmp_path / "twin.toml", path)["flow"], abs=1e-3)
+    assert rms(flow - recording.outputs["flow"]) < 1.1 * 0.01
+
+
+def test_states_without_equations_are_refused(tmp_path: Path) -> None:
+    text = CURVE.replace("[twin.outputs]", '[twin.states]\nv = "m/s"\n[twin.outputs]')
+    with pytest.raises(RecordingError, match="equations"):
+        simulate_own(load(recorded(tmp_path, 0.0, text)))
