@@ -133,8 +133,8 @@ fixed = ["inertia"]      # the data show only ratios of the three, so one must b
 hold = "zero"
 ```
 
-The keys of a kind stand in `[twin.parameters]` or, as `states` and `equations` here, in `[twin]`. A curve has no states:
-give `outputs = { flow = "a * sqrt(pressure)" }` and `a` alone.
+The keys of a kind stand in `[twin.parameters]` or, as `states` and `equations` here, in `[twin]`. A curve has no
+states: give `outputs = { flow = "a * sqrt(pressure)" }` and `a` alone.
 
 {equations}
 
