@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
 
 from tools.guest.equations import Builder, EquationError, trace
-from tools.mismatch.twins.program import parse, run_program
+from tools.mismatch.twins.native import code_of, run_code
+from tools.mismatch.twins.program import parse
+
+
+@numba.njit
+def run(address, registers):
+    run_code(address, registers)
 
 
 def value_of(text: str, **values: float) -> float:
     builder = Builder(tuple(values))
     program = builder.program(parse(builder, {"wanted": text}, ["wanted"]))
-    registers = program.registers.copy()
+    address, registers, results = code_of(program)
     registers[: len(values)] = [*values.values()]
-    run_program(program.operations, registers)
-    return float(registers[program.results[0]])
+    run(address, registers)
+    return float(registers[results[0]])
 
 
 @pytest.mark.parametrize(
@@ -63,9 +70,9 @@ def test_a_python_function_becomes_the_same_equations() -> None:
     found = trace(builder, derivatives, {"states": ("x", "v"), "inputs": ("u",), "parameters": ("c",)})
     program = builder.program([found["x"], found["v"]])
     for values in ((1.0, 0.5, 1.5, 2.0, 0.3), (2.0, 0.5, -1.5, 2.0, 0.3)):
-        registers = program.registers.copy()
+        address, registers, _ = code_of(program)
         registers[: len(names)] = values
-        run_program(program.operations, registers)
+        run(address, registers)
         t, x, v, u, c = values
         expected = derivatives(t, {"x": x, "v": v}, {"u": u}, {"c": c})
         assert [registers[i] for i in program.results] == pytest.approx([expected["x"], expected["v"]], rel=1e-14)

@@ -15,6 +15,7 @@ from sim_devices.physics.forces import FLOW
 from tools.guest.equations import Program
 from tools.mismatch.twins.affine import is_affine
 from tools.mismatch.twins.feedback import Rows
+from tools.mismatch.twins.native import Code, code_of
 from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive, Packed, rates_of, run_equations, run_readings
 
 STATE_STEP = 1e-4
@@ -115,7 +116,7 @@ class Equations(Protocol):
 
 @dataclass(frozen=True)
 class Programs:
-    """Runs equations that are data (``program.py``); the loop is compiled once for all of them."""
+    """Runs equations that are data (``program.py``), as machine code within a loop that is compiled once for all."""
 
     rates_program: Program
     outputs: Program
@@ -148,10 +149,10 @@ class Programs:
         """See Equations."""
         return run_readings(self._set(self.rates_program, values), x, u, t, NO_SWAY)
 
-    def _set(self, program: Program, values: Array) -> Program:
-        registers = program.registers.copy()
-        registers[self.at : self.at + values.size] = values
-        return program._replace(registers=registers)
+    def _set(self, program: Program, values: Array) -> Code:
+        code = code_of(program)
+        code.registers[self.at : self.at + values.size] = values
+        return code
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, flow_of, friction_limit, smooth_force
 from sim_devices.physics.parameter import BY_LOG, OWN_SIGN, RATE_SIGN
-from tools.mismatch.twins.program import run_program
+from tools.mismatch.twins.native import run_code
 
 SWAY = 6
 """Number of columns of a varying parameter: its register, the register that it follows, strength, centre, and in place
@@ -76,12 +76,12 @@ def varied(value, sway, c):
 
 
 @kernel
-def rates_of(program, x, u):
+def rates_of(code, x, u):
     """Return the derivatives (s,) of the states ``x`` (s,) at the inputs ``u`` (m,) at time zero, without forces.
 
     Registers of the program, which change: time, states, inputs (and recorded signals), parameters.
     """
-    operations, registers, results = program
+    address, registers, results = code
     s, m = x.size, u.size
     rates = np.empty(s)
     registers[0] = 0.0
@@ -89,14 +89,14 @@ def rates_of(program, x, u):
         registers[1 + i] = x[i]
     for i in range(m):
         registers[1 + s + i] = u[i]
-    run_program(operations, registers)
+    run_code(address, registers)
     for i in range(s):
         rates[i] = registers[results[i]]
     return rates
 
 
 @kernel
-def run_equations(program, drive, packed, x0, limits):
+def run_equations(code, drive, packed, x0, limits):
     """Return states (n, s) of a free run from ``x0`` (starts, s) by fourth-order Runge-Kutta.
 
     ``drive``: a ``Drive``; ``packed``: ``Packed``. States stay within ``limits``, lowest and highest (s,).
@@ -109,7 +109,7 @@ def run_equations(program, drive, packed, x0, limits):
     The derivative is computed in one place of the loop and not in a function: a call that passes arrays counts
     references to each of them, which costs more than the equations.
     """
-    operations, registers0, results = program
+    address, registers0, results = code
     u, held, times, step_s, sub, fine, starts, stop = drive
     place, friction, spring, cogging, counts, thresholds, memory, flows, sway, joints = packed
     lowest, highest = limits
@@ -214,7 +214,7 @@ def run_equations(program, drive, packed, x0, limits):
                                 elif sway[c, 4] == OWN_SIGN:
                                     value = np.sign(value)
                                 registers[r] *= varied(value, sway, c)
-                        run_program(operations, registers)
+                        run_code(address, registers)
                         if last == 0:
                             for c in range(sway.shape[0]):
                                 if sway[c, 4] == RATE_SIGN:
@@ -316,12 +316,12 @@ def run_equations(program, drive, packed, x0, limits):
 
 
 @kernel
-def run_readings(program, x, u, t, sway):
+def run_readings(code, x, u, t, sway):
     """Return outputs (n, q) for states (n, s), inputs (n, m) and times (n,).
 
     ``sway`` (k, SWAY) are varying parameters; one that follows a direction is constant here.
     """
-    operations, registers0, results = program
+    address, registers0, results = code
     n = u.shape[0]
     out = np.empty((n, results.size))
     registers = registers0.copy()
@@ -337,7 +337,7 @@ def run_readings(program, x, u, t, sway):
         for c in range(sway.shape[0]):
             if sway[c, 4] == 0.0 or sway[c, 4] == BY_LOG:
                 registers[int(sway[c, 0])] *= varied(registers[int(sway[c, 1])], sway, c)
-        run_program(operations, registers)
+        run_code(address, registers)
         for j in range(results.size):
             out[k, j] = registers[results[j]]
     return out

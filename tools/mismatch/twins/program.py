@@ -1,7 +1,7 @@
-"""Represents equations as data: parsed from text or traced from a Python function, run by a compiled interpreter.
+"""Represents equations as data: parsed from text or traced from a Python function, and run as machine code.
 
 A program is a list of operations on registers. It contains no Python code, so equations of an untrusted recording are
-safe to read, and no new equation has to be compiled.
+safe to read (``native.py`` compiles the operations).
 """
 
 from __future__ import annotations
@@ -10,9 +10,6 @@ import ast
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from hal.compiled import inlined_kernel
 from tools.guest.equations import (
     ADD,
     DIV,
@@ -28,61 +25,6 @@ from tools.guest.equations import (
     EquationError,
     called,
 )
-
-
-@inlined_kernel
-def run_program(operations, registers):
-    """Carry out the operations; ``registers`` (r,) change in place."""
-    for i in range(operations.shape[0]):
-        code = operations[i, 0]
-        a = registers[operations[i, 2]]
-        b = registers[operations[i, 3]]
-        # arithmetic is tested first: a long chain of comparisons costs more than the operation
-        if code < 4:
-            if code < 2:
-                v = a + b if code == 0 else a - b
-            else:
-                v = a * b if code == 2 else a / b
-        elif code < 10:
-            if code == 4:
-                v = a * a if b == 2.0 else a**b
-            elif code == 5:
-                v = -a
-            elif code == 6:
-                v = abs(a)
-            elif code == 7:
-                v = 1.0 if a > 0.0 else (-1.0 if a < 0.0 else 0.0)
-            elif code == 8:
-                v = np.sqrt(a)
-            else:
-                v = np.exp(a)
-        elif code < 17:
-            if code == 10:
-                v = np.log(a)
-            elif code == 11:
-                v = np.sin(a)
-            elif code == 12:
-                v = np.cos(a)
-            elif code == 13:
-                v = np.tan(a)
-            elif code == 14:
-                v = np.tanh(a)
-            elif code == 15:
-                v = np.arctan(a)
-            else:
-                v = np.arctan2(a, b)
-        elif code == 17:
-            v = min(a, b)
-        elif code == 18:
-            v = max(a, b)
-        elif code == 19:
-            v = 1.0 if a < b else 0.0
-        elif code == 20:
-            v = 1.0 if a <= b else 0.0
-        else:
-            v = b if a != 0.0 else registers[operations[i, 4]]
-        registers[operations[i, 1]] = v
-
 
 _BINARY: Mapping[type[ast.operator], int] = {ast.Add: ADD, ast.Sub: SUB, ast.Mult: MUL, ast.Div: DIV, ast.Pow: POW}
 _COMPARED: Mapping[type[ast.cmpop], tuple[int, bool]] = {
