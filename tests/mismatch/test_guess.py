@@ -25,6 +25,7 @@ from tools.mismatch.recording_load import load
         ("wheel_l", ("wheel_l", "")), ("tank_ml", ("tank", "ml")), ("speed_in_s", ("speed_in", "s")),
         ("dilution_1_h", ("dilution", "1/h")), ("feed_g_l", ("feed", "g/l")), ("flow_l_min", ("flow", "l/min")),
         ("charge_A_h", ("charge", "Ah")), ("x_V_min", ("x_V_min", "")), ("pump_1_s", ("pump_1", "s")),
+        ("force_N_l", ("force_N_l", "")), ("pump_1_l", ("pump_1_l", "")), ("flow_m3_h", ("flow", "m3/h")),
     ],
 )  # fmt: skip
 def test_units_are_read_from_names(name: str, parts: tuple[str, str]):

@@ -246,7 +246,7 @@ def builder_of(
     names: tuple[str, ...], operations: Sequence[Sequence[int]], registers: Array, results: Mapping[str, int]
 ) -> tuple[Builder, dict[str, int]]:
     """Return the builder and results that another process sent. ValueError for operations that reach beyond the
-    registers: the compiled interpreter does not check them again.
+    registers: the machine code does not check them again.
     """
     rows = np.array(operations, np.int64).reshape(-1, 5)
     found = {str(name): int(register) for name, register in results.items()}
@@ -259,5 +259,6 @@ def builder_of(
         raise ValueError("an operation that writes to a variable")
     builder = Builder(names)
     builder.operations = [(a, b, c, d, e) for a, b, c, d, e in rows.tolist()]
-    builder.values = registers.tolist()
+    # a number where a variable stands would become a constant of the machine code
+    builder.values = [0.0] * len(names) + registers[len(names) :].tolist()
     return builder, found

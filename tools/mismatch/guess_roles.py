@@ -17,11 +17,12 @@ Fits = Callable[[str, str, str, tuple[str, ...]], bool]
 _SUFFIX = re.compile(
     r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
 )
-_QUOTIENT = re.compile(
-    r"^(?P<name>.+?)_(?:(?P<over>1(?=_h$)|[^\W\d_]+)_(?P<under>s2?|m2|h|[lL])|(?P<amount>m?[lL]|k?g|m?mol|m3)_(?P<per>min))$"
-)
-"""A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``, ``feed_g_l``. A
-minute only under an amount, because ``x_V_min`` is a smallest voltage."""
+_QUOTIENT = re.compile(r"^(?P<name>.+?)_(?P<over>1|[^\W\d_]+\d?)_(?P<under>s2?|m2|h|min|[lL])$")
+"""A unit that is a quotient, in a language whose names hold no stroke: ``speed_rad_s``, ``sun_W_m2``, ``feed_g_l``."""
+_AMOUNT = r"km|m3|m?[lL]|[mk]?g|m?mol"
+_OVER = {"h": rf"1|{_AMOUNT}|[mk]?[AW]", "min": _AMOUNT, "l": r"[mku]?g|[mu]?mol", "L": r"[mku]?g|[mu]?mol"}
+"""What may stand over a last part that is also a word or a side: ``x_V_min`` is a smallest voltage, ``force_N_l`` the
+left one."""
 _SPOKEN = {"mps": "m/s", "mps2": "m/s^2", "radps": "rad/s", "radps2": "rad/s^2"}
 """Units as names of columns spell them."""
 _ORDINARY_WORDS = ("in", "ft", "min", "h", "l", "L", "F", "H")
@@ -60,10 +61,10 @@ def split_unit(name: str) -> tuple[str, str]:
     """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
     quotient = _QUOTIENT.match(name.strip())
     if quotient is not None and quotient["over"] != "in":
-        over, under = quotient["over"] or quotient["amount"], quotient["under"] or quotient["per"]
+        over, under = quotient["over"], quotient["under"]
         # ampere hours and watt hours are products
         unit = f"{over}h" if under == "h" and over[-1] in "AW" else f"{over}/{under}"
-        if units.is_unit(unit):
+        if re.fullmatch(_OVER.get(under, r"[^\W\d_]+"), over) and units.is_unit(unit):
             return quotient["name"], unit
     found = _SUFFIX.match(name.strip())
     if found is None:

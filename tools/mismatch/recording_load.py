@@ -251,7 +251,7 @@ def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
     if not isinstance(parameters, Mapping):
         raise RecordingError(f"{where}: [twin.parameters] must be a table")
     beside = {k: v for k, v in value.items() if k not in TWIN_KEYS}
-    for key in beside.keys() & parameters.keys():
+    for key in sorted(beside.keys() & parameters.keys()):
         raise RecordingError(f"{where}: '{key}' stands in [twin] and in [twin.parameters]; leave one of them out")
     parameters = {**parameters, **beside}
     if kind == "ode" and "outputs" in parameters and not {"states", "equations", "function"} & set(parameters):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.engine import screen
 from tools.mismatch.engine.fit import fit
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.score import misfits
-from tools.mismatch.engine.screen import bend, one_step, places
-from tools.mismatch.engine.trial import extended
+from tools.mismatch.engine.screen import bend, one_step, places, starts_on
+from tools.mismatch.engine.trial import extended, hopeful
 from tools.mismatch.recording import Recording
 
 PITCH_M = 0.011
@@ -89,3 +92,26 @@ def test_a_limit_before_a_plant_that_integrates_is_met_though_every_stretch_star
     assert found["upper_limit"] == pytest.approx(1.3, rel=0.01)
     assert found["lower_limit"] == pytest.approx(-1.3, rel=0.01)
     assert left < 5.0
+
+
+def test_candidates_on_another_base_start_near_its_one_run() -> None:
+    problem, _, base = prepared(motor(), 0.3, 0, False)
+    other = base.theta.copy()
+    other[: base.model.n_base] = base.model.twin.start(problem.recording)
+    near = starts_on(problem, base, other)
+    assert starts_on(problem, base, other) is near
+    (found,) = near.of_stretches.values()
+    alone = base.model.simulate(problem.view, other)["angle"]
+    assert base.model.simulate(problem.view.near(near), other)["angle"] == pytest.approx(alone, abs=1e-6)
+    assert found.states.shape[1:] == (2, 2)
+
+
+def test_what_its_own_test_refuses_takes_no_step_and_no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _, base = prepared(motor(), 0.3, 0, False)
+    place = places(problem, (EFFECTS["quantization"],), ())[0]
+    monkeypatch.setattr(screen, "_step_gain", lambda *_: pytest.fail("a step of a refused effect"))
+    candidate = one_step(problem, base, place, bend(problem, base))
+    assert candidate.refused
+    strong = replace(candidate, share=0.9)
+    assert hopeful([strong]) == [False]
+    assert hopeful([replace(strong, p_value=1e-9)]) == [True]

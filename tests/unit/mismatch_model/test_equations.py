@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from tools.guest.equations import Builder, EquationError, trace
+from tools.guest.equations import Builder, EquationError, builder_of, trace
 from tools.mismatch.twins.native import code_of, run_code
 from tools.mismatch.twins.program import parse
 
@@ -41,6 +41,39 @@ def value_of(text: str, **values: float) -> float:
 @pytest.mark.parametrize(("a", "b"), [(0.3, 1.7), (2.5, 1.1)])
 def test_an_equation_says_what_python_would(text: str, expected, a: float, b: float) -> None:
     assert value_of(text, a=a, b=b) == pytest.approx(expected(a, b), rel=1e-14)
+
+
+NUMBERS = (-math.inf, -2.5, -0.0, 0.0, 0.3, 2.0, math.inf, math.nan)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a / b", np.divide), ("a * b", np.multiply), ("a ** b", np.power), ("atan2(a, b)", np.arctan2),
+        ("sqrt(a)", lambda a, b: np.sqrt(a)), ("exp(a)", lambda a, b: np.exp(a)), ("log(a)", lambda a, b: np.log(a)),
+        ("tan(a)", lambda a, b: np.tan(a)), ("tanh(a)", lambda a, b: np.tanh(a)), ("abs(a)", lambda a, b: np.abs(a)),
+        ("a ** 2", lambda a, b: a * a), ("-a", lambda a, b: -a), ("arctan(a)", lambda a, b: np.arctan(a)),
+        # of a number and none: the first one, as Python's own have it
+        ("min(a, b)", lambda a, b: min(a, b)), ("max(a, b)", lambda a, b: max(a, b)),
+        ("sign(a)", lambda a, b: 1.0 if a > 0 else -1.0 if a < 0 else 0.0),
+        ("a if a < b else b", lambda a, b: a if a < b else b), ("where(a, b, 7)", lambda a, b: b if a != 0 else 7.0),
+        ("a if a >= b else 3", lambda a, b: a if a >= b else 3.0),
+    ],
+)  # fmt: skip
+def test_machine_code_treats_every_number_as_numpy_does(text: str, expected) -> None:
+    for a in map(np.float64, NUMBERS):
+        for b in map(np.float64, NUMBERS):
+            with np.errstate(all="ignore"):
+                right = expected(a, b)
+            assert value_of(text, a=a, b=b) == pytest.approx(right, rel=1e-14, abs=0, nan_ok=True), (a, b)
+
+
+def test_a_program_of_another_process_has_no_number_in_the_place_of_a_variable() -> None:
+    builder, found = builder_of(("a",), [[0, 2, 0, 1, 0]], np.array([9.0, 4.0, 0.0]), {"y": 2})
+    address, registers, results = code_of(builder.program([found["y"]]))
+    registers[0] = 1.0
+    run(address, registers)
+    assert registers[results[0]] == 5.0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
 from tools.mismatch.twins.memo import Nearby, stored
 
+LEAST_P = 1e-3
+"""Largest p-value of an effect's own test at which it may be named."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -33,6 +36,11 @@ class Candidate:
     p_value: float
     tested: bool
     starts: tuple[Array, ...]
+
+    @property
+    def refused(self) -> bool:
+        """Return True if the effect's own test is negative: then no fit, alone or with others, makes it a name."""
+        return self.tested and self.p_value > LEAST_P
 
 
 def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, ...]) -> list[Placed]:
@@ -99,8 +107,6 @@ OWN_SHARE = 0.05  # least share of the residual of the engineer's base that an e
 
 
 STEP = 1e-3  # of a parameter, for its sensitivities
-LEAST_P = 1e-3
-"""Largest p-value of an effect's own test at which it may be named."""
 
 
 def bend(problem: Problem, current: Fit, step: float = STEP) -> Ground:
@@ -147,7 +153,7 @@ def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> C
     theta = model.carry(current.model, current.theta, problem.recording)
     k = len(model.placed) - 1
     begin = starts(model, k, problem.fit_view, theta)
-    share, p_value, tested = 0.0, 1.0, False
+    found = Candidate(placed, 0.0, 1.0, False, tuple(begin))
     if placed.effect.test is not None:
         o = placed.outputs[0]
         x, ctx = probe_signals(current.model, problem.fit_view, current.theta, placed, o)
@@ -155,15 +161,14 @@ def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> C
         index = problem.fit_view.index
         full[index] = current.residual[o][problem.row_of_sample[index]]
         signature = placed.effect.test(x, full, ctx)
-        share, p_value, tested = signature.share, signature.p_value, True
-    refused = tested and p_value > LEAST_P
-    for start in () if refused else begin[:6]:
+        found = replace(found, share=signature.share, p_value=signature.p_value, tested=True)
+        if found.refused:
+            return found
+    for start in begin[:6]:
         gained, p = _step_gain(problem, current, model, start, ground)
-        share = max(share, gained)
-        if not tested:
-            p_value = min(p_value, min(1.0, p * len(begin)))
-    found = Candidate(placed, share, p_value, tested, tuple(begin))
-    if tested:
+        p_value = found.p_value if found.tested else min(found.p_value, p * len(begin))
+        found = replace(found, share=max(found.share, gained), p_value=p_value)
+    if found.tested:
         return found
     hinted = (_from_hint(problem, current, hint, ground) for hint in problem.hints if _is_about(hint, place))
     return max((found, *hinted), key=lambda c: c.share)
@@ -192,7 +197,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     base = current.theta.copy()
     base[: model.n_base] = theta[: model.n_base]
     elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
-    nearby = _starts_on(problem, current, base) if elsewhere_based else ground.nearby
+    nearby = starts_on(problem, current, base) if elsewhere_based else ground.nearby
     view = problem.view.near(nearby)
     design = model.design(view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
@@ -258,7 +263,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     return max(0.0, share), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
 
 
-def _starts_on(problem: Problem, current: Fit, theta: Array) -> Nearby:
+def starts_on(problem: Problem, current: Fit, theta: Array) -> Nearby:
     """Return the start states of the current model on another base, near which its candidates start there."""
     key = ("starts on", current.model.key, theta.tobytes())
     known = problem.view.memo.get(key)

@@ -12,7 +12,7 @@ from tools.mismatch.engine.fit import ROUGH, Fit, fit
 from tools.mismatch.engine.linearised import fit_beside
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, compare, misfits
-from tools.mismatch.engine.screen import LEAST_P, Candidate, Ground, bend, is_wide, one_step
+from tools.mismatch.engine.screen import Candidate, Ground, bend, is_wide, one_step
 from tools.mismatch.engine.vary import with_balance
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
@@ -69,11 +69,6 @@ class Trial:
     @property
     def name(self) -> str:
         return self.placed.effect.name
-
-
-def is_refused(c: Candidate) -> bool:
-    """Return True if the effect's own test is negative: then no fit, alone or with others, makes it a name."""
-    return c.tested and c.p_value > LEAST_P
 
 
 def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Array]:
@@ -150,9 +145,7 @@ def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int 
     for o in outputs:
         for kind in ("specific", "flexible", "tested", "inside"):
             of = inside if kind == "inside" else kinds
-            here = [
-                i for i, c in enumerate(candidates) if o in c.placed.outputs and of[i] == kind and not is_refused(c)
-            ]
+            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and of[i] == kind and not c.refused]
             here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
             top = candidates[here[0]].share if here else 0.0
             names = list(dict.fromkeys(candidates[i].placed.effect.name for i in here))
