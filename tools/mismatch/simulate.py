@@ -22,7 +22,7 @@ from tools.mismatch.twins.base import Force, Path, Run, Signal, Twin, fold
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.linear import roughness
-from tools.mismatch.twins.memo import remember
+from tools.mismatch.twins.memo import Nearby, remember, stored
 from tools.mismatch.twins.ode import PUSHED, inside_of, weight_scale
 
 START_PASSES = 8
@@ -228,14 +228,30 @@ class Model:
         return {o: view.take(fold(s, theta).value) for o, s in outputs.items()}
 
     def whole(self, view: View, theta: Array) -> dict[str, Array]:
-        """Return the outputs over the whole recording (n,) from the start states that the view allows; cached."""
-        key = ("whole", self.key, theta.tobytes())
+        """Return the outputs over the whole recording (n,) from the start states that the view allows.
+
+        They are cached, but for those of a search, which start near an earlier run.
+        """
 
         def make() -> Array:
             flow = self._courses(view_run(self.twin, view), Pass(theta, True))[0]
             return np.stack([flow[o].value for o in self.twin.outputs])
 
-        return dict(zip(self.twin.outputs, remember(view.memo, key, make), strict=True))
+        key = ("whole", self.key, theta.tobytes())
+        found = make() if view.nearby is not None else remember(view.memo, key, make)
+        return dict(zip(self.twin.outputs, found, strict=True))
+
+    def started(self, view: View, theta: Array) -> Nearby:
+        """Return the start states of a run, and how they act on it: other runs start near them; cached."""
+        key = ("started", self.key, theta.tobytes())
+        known = view.memo.get(key)
+        if isinstance(known, Nearby):
+            return known
+        near = view.near()
+        assert near.nearby is not None
+        self.simulate(near, theta)
+        stored(view.memo, key, near.nearby, near.nearby.nbytes)
+        return near.nearby
 
     def residual(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
         """Return measured minus simulated outputs on the view."""

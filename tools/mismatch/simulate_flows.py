@@ -96,6 +96,9 @@ def tried_together(model: Model, k: int, view: View, theta: Array, output: str) 
     _, b = model.slices(k)
     at = theta.copy()
     at[b] = 0.0
+    # without weights it is the model without the flow, whose start states all candidates share
+    rest = Model(model.twin, [p for j, p in enumerate(model.placed) if j != k])
+    view = view.near(rest.started(view, rest.carry(model, theta, view.recording)))
     now = model.residual(view, at, (output,))[output]
     moved: Sequence[int] = [*range(b.start, b.stop), *range(model.n_base)]
     steps = [1e-2 * (model.parameters[j].scale or 1.0) for j in moved]

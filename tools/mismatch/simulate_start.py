@@ -228,15 +228,23 @@ def bends(model: Model, view: View, theta: Array, output: str) -> Array | None:
     searched = [i for i in model.nonlinear if i < model.n_base]
     if not searched or len(searched) * view.recording.n * len(model.twin.outputs) > MOST_BENDS:
         return None
-    now = model.whole(view, theta)[output]
-    columns: list[Array] = []
-    for i in searched:
-        p = model.parameters[i]
-        h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
-        shifted = theta.copy()
-        shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
-        columns.append((model.whole(view, shifted)[output] - now) / (shifted[i] - theta[i]))
-    return np.column_stack(columns) if np.all(np.isfinite(columns)) else None
+
+    def make() -> Array:
+        near = view.near(model.started(view, theta))
+        now = model.whole(near, theta)
+        columns: list[list[Array]] = []
+        for i in searched:
+            p = model.parameters[i]
+            h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
+            shifted = theta.copy()
+            shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
+            moved = model.whole(near, shifted)
+            columns.append([(moved[o] - now[o]) / (shifted[i] - theta[i]) for o in model.twin.outputs])
+        return np.ascontiguousarray(np.transpose(columns, (1, 2, 0)))
+
+    at = model.twin.outputs.index(output)
+    found = remember(view.memo, ("bends", model.key, theta.tobytes()), make)[at]
+    return found if np.all(np.isfinite(found)) else None
 
 
 OVERFLOW = 1e100

@@ -13,7 +13,7 @@ from tools.mismatch.engine import screen
 from tools.mismatch.engine.fit import fit
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.score import misfits
-from tools.mismatch.engine.screen import bend, one_step, places, starts_on
+from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import extended, hopeful
 from tools.mismatch.recording import Recording
 
@@ -98,8 +98,8 @@ def test_candidates_on_another_base_start_near_its_one_run() -> None:
     problem, _, base = prepared(motor(), 0.3, 0, False)
     other = base.theta.copy()
     other[: base.model.n_base] = base.model.twin.start(problem.recording)
-    near = starts_on(problem, base, other)
-    assert starts_on(problem, base, other) is near
+    near = base.model.started(problem.view, other)
+    assert base.model.started(problem.view, other) is near
     (found,) = near.of_stretches.values()
     alone = base.model.simulate(problem.view, other)["angle"]
     assert base.model.simulate(problem.view.near(near), other)["angle"] == pytest.approx(alone, abs=1e-6)

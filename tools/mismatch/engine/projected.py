@@ -119,7 +119,8 @@ class Projected:
 
     def anew(self) -> None:
         """Forget the start states of the search before."""
-        self.view = self.problem.view.near()
+        known = self.view.nearby
+        self.view = self.problem.view.near(known.elsewhere() if known is not None else None)
 
     @property
     def is_near(self) -> bool:

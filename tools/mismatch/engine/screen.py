@@ -17,7 +17,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
-from tools.mismatch.twins.memo import Nearby, stored
+from tools.mismatch.twins.memo import Nearby
 
 LEAST_P = 1e-3
 """Largest p-value of an effect's own test at which it may be named."""
@@ -197,7 +197,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     base = current.theta.copy()
     base[: model.n_base] = theta[: model.n_base]
     elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
-    nearby = starts_on(problem, current, base) if elsewhere_based else ground.nearby
+    nearby = current.model.started(problem.view, base) if elsewhere_based else ground.nearby
     view = problem.view.near(nearby)
     design = model.design(view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
@@ -261,19 +261,6 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     # the gain of another base by itself is not the effect's
     share = 1 - after / (before_ if null - after > OWN_SHARE * null else null)
     return max(0.0, share), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
-
-
-def starts_on(problem: Problem, current: Fit, theta: Array) -> Nearby:
-    """Return the start states of the current model on another base, near which its candidates start there."""
-    key = ("starts on", current.model.key, theta.tobytes())
-    known = problem.view.memo.get(key)
-    if isinstance(known, Nearby):
-        return known
-    view = problem.view.near()
-    assert view.nearby is not None
-    current.model.simulate(view, theta)
-    stored(problem.view.memo, key, view.nearby, view.nearby.nbytes)
-    return view.nearby
 
 
 def _is_weight(model: Model, j: int) -> bool:

@@ -56,6 +56,8 @@ class Nearby:
     """
 
     of_stretches: dict[bytes, Start] = field(default_factory=dict[bytes, Start])
+    earlier: dict[bytes, Start] = field(default_factory=dict[bytes, Start])
+    """Starts at an earlier place of the search, where the search for those of this place begins."""
 
     @property
     def nbytes(self) -> int:
@@ -63,4 +65,8 @@ class Nearby:
 
     def copy(self) -> Nearby:
         """Return the same starts for another search, which may add its own."""
-        return Nearby(dict(self.of_stretches))
+        return Nearby(dict(self.of_stretches), dict(self.earlier))
+
+    def elsewhere(self) -> Nearby:
+        """Return what is known of the starts at another place of the search."""
+        return Nearby(earlier={**self.earlier, **self.of_stretches})

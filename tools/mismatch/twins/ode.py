@@ -17,19 +17,13 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.twins.affine import Steps, exact_steps, run_pushed
 from tools.mismatch.twins.base import Balance, Counted, Force, Run, Signal, central_difference, fold, midway
 from tools.mismatch.twins.equations import (
-    LEAST_SHOWN,
     NOTHING,
-    STATE_STEP,
     Equations,
     Inside,
     Linearised,
     Place,
     State,
-    edges_of,
     linearise,
-    meet_start,
-    slopes_of,
-    start_step,
 )
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.forced import shot_to_repeat
@@ -38,6 +32,7 @@ from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import Start, remember, stored
 from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive
+from tools.mismatch.twins.ode_start import StartSearch
 
 MOST_SUBSTEPS = 200
 FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
@@ -412,10 +407,11 @@ class OdeTwin(Head):
         x0 = np.where(np.isfinite(x0), x0, given)
         reading = remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
         weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
-        stop = np.asarray(np.minimum(starts + run.start_window, ends), np.int64)
-        first = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
-        every_sample = run.setting if self.integrates else None
-        seen = first if every_sample is None else every_sample
+        whole = run.setting if self.integrates else None
+        seen = whole
+        if seen is None:
+            stop = np.minimum(starts + run.start_window, ends)
+            seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
         if steps is not None and self.reads_affine and all(p.is_linear for p in run.paths.values()):
             x = steps.run(x0, u, starts, ends)
             y = self.equations.readings(x, u, run.t, values)
@@ -430,79 +426,17 @@ class OdeTwin(Head):
                 slopes = np.einsum("qi,nij->nqj", weight[:, None] * reading, states[seen])
                 run.nearby.of_stretches.setdefault(starts.tobytes(), Start(x[starts], states, slopes))
             return x
-        used, rows = np.unique(np.searchsorted(starts, seen, side="right") - 1, return_inverse=True)
-        edges = edges_of(rows, used.size)
-        every = np.arange(run.t.size)
-        at = every if run.paths else seen  # what is measured behind effects depends on all that was before
-        measured = np.column_stack([run.measured[o] for o in self.outputs])
-        part, t = u[at], run.t[at]
-        tried: list[tuple[Array, Array]] = []
 
-        def missed_of(x: Array) -> Array:
-            readings = self.equations.readings(x[at], part, t, values, inside.sway)
-            behind = self._behind_paths(run, readings, every)[seen] if run.paths else readings
-            return (measured[seen] - behind) * weight
+        def read(x: Array, u: Array, t: Array) -> Array:
+            return self.equations.readings(x, u, t, values, inside.sway)
 
-        def misses(some: Array) -> Array:
-            start = x0.copy()
-            start[used] = some
-            x = go(start, starts, ends, u, run.t)
-            tried.append((some, x))
-            return missed_of(x)
-
-        def moved_along(nearest: Start, missed: Array, x: Array) -> Array:
-            turn = np.zeros(nearest.x0.shape)
-            turn[used], _ = start_step(nearest.slopes, missed, edges)
-            turn = (np.clip(nearest.x0 + self.typical * turn, *limits) - nearest.x0) / self.typical
-            return x + np.einsum("nij,nj->ni", nearest.states, np.repeat(turn, ends - starts, axis=0))
-
-        nearest = run.nearby.of_stretches.get(starts.tobytes()) if run.nearby is not None else None
-        if nearest is not None:
-            x0 = nearest.x0
-            return moved_along(nearest, misses(x0[used]), tried[0][1])
-        # the windows that set the state are simulated alone, one after the other
-        after = np.cumsum(stop - starts)
-        before = after - (stop - starts)
-        alone, when = np.ascontiguousarray(u[first]), run.t[first]
-
-        def misses_alone(x0: Array) -> Array:
-            x = go(x0, before, after, alone, when)
-            readings = self.equations.readings(x, alone, when, values, inside.sway)
-            return (measured[first] - self._behind_paths(run, readings, first)) * weight
-
-        x0 = self.as_read(x0, measured[starts], u[starts], run.t[starts], values, reading)
-        windows = list(zip(before.tolist(), after.tolist(), strict=True))
-        x0 = meet_start(x0, misses_alone, windows, self.typical, limits)
-        if every_sample is not None:
-            # then all permitted samples count: the first ones are noisy, and an effect behind may hide the state there
-            found = meet_start(x0[used], misses, edges, self.typical, limits, rounds=1)
-            # each stretch starts anew, and has been run from the state that was found
-            out = tried[0][1].copy()
-            for k, i in enumerate(used):
-                x = next(x for some, x in tried if np.array_equal(some[k], found[k], equal_nan=True))
-                out[starts[i] : ends[i]] = x[starts[i] : ends[i]]
-            x0[used] = found
-        else:
-            out = go(x0, starts, ends, u, run.t)
-        if run.nearby is None or not np.all(np.isfinite(out)):
-            return out
-        if every_sample is None:
-            tried.clear()
-            slopes_of(x0[used], misses(x0[used]), misses, self.typical)
-        # the runs of the round beside which the states were found; one more beside these tells little else
-        begin, turned = tried[0][1], [x for _, x in tried[1 : 1 + len(self.state_list)]]
-        states = np.stack([(x - begin) / STATE_STEP for x in turned], axis=-1)
-        slopes = np.stack([(missed_of(begin) - missed_of(x)) / STATE_STEP for x in turned], axis=-1)
-        if not np.all(np.isfinite(slopes)):
-            return out
-        run.nearby.of_stretches[starts.tobytes()] = Start(x0, states, slopes)
-        return moved_along(run.nearby.of_stretches[starts.tobytes()], missed_of(out), out)
-
-    def _behind_paths(self, run: Run, y: Array, at: NDArray[np.int64]) -> Array:
-        """Return what is measured (m, q) of outputs ``y`` (m, q) at the samples ``at``."""
-        if not run.paths:
-            return y
-        return np.stack([run.behind_path(o, y[:, i], at) for i, o in enumerate(self.outputs)], axis=1)
+        search = StartSearch(
+            run, u, starts, ends, seen, whole is not None, self.outputs, weight, self.typical, limits, go, read
+        )
+        for found in (search.from_nearest, search.from_earlier):
+            if (x := found()) is not None:
+                return x
+        return search.anew(x0, reading)
 
     @cached_property
     def has_exact_steps(self) -> bool:
@@ -517,15 +451,6 @@ class OdeTwin(Head):
     def exact_steps(self, dt: float, values: Array) -> Steps:
         """Return the steps of affine equations for these numbers."""
         return exact_steps(lambda x, u: self.equations.rates(x, u, values), self.typical, self.middle[1], dt, self.held)
-
-    def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array, c: Array) -> Array:
-        """Move states (k, s) as little as possible so that the outputs (k, q), of slopes ``c`` (q, s), are as measured.
-
-        A run that has drifted away does not determine the start of the next one in a position-dependent force.
-        """
-        reading = c * self.typical
-        gap = y - self.equations.readings(np.ascontiguousarray(x), np.ascontiguousarray(u), t, values)
-        return x + gap @ np.linalg.pinv(reading, rcond=LEAST_SHOWN).T * self.typical
 
     # -- linearised -----------------------------------------------------------------------------------
 
