@@ -32,8 +32,8 @@ from hal.jsonable import to_jsonable
 RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
 MODULES = (
-    "step", "kinematics", "latency", "wire", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder",
-    "memory", "start", "bench_page",
+    "step", "kinematics", "latency", "wire", "loop", "world", "attitude", "noise", "hysteresis", "mismatch",
+    "equations", "recorder", "memory", "start", "bench_page",
 )  # fmt: skip
 LIMIT_S = 1200.0
 """A module that takes longer is stopped. The longest is the wire, about half of it on a slow machine."""

@@ -287,3 +287,43 @@ def test_play_of_a_joint_is_a_spring_that_takes_hold_beyond_the_gap(tmp_path: Pa
     plain = Model(twin).simulate(View.whole(recording), theta[: model.n_base])["load"]
     assert np.std(found - plain) > 0.01 * np.std(found)
     np.testing.assert_allclose(found, course, rtol=0, atol=2e-3 * np.std(plain - found))
+
+
+@pytest.mark.parametrize("lean", [None, 0.4])
+def test_a_loop_that_bends_within_wide_steps_is_its_differential_equation(tmp_path: Path, lean: float | None) -> None:
+    """Against an integrator with steps of its own (Wen 1976, eq. 3): parts are needed where it turns alone."""
+    twin_text = (
+        '[twin]\nkind = "ode"\n[twin.states]\nangle = "rad"\nrate = "rad/s"\n[twin.equations]\nangle = "rate"\n'
+        'rate = "command - 0.4 * rate - k * angle"\n[twin.parameters]\nk = 30.0\n'
+    )
+    recording = recorded(tmp_path, twin_text, 20.0 * command(), 0.1 * command())
+    twin = inside_of(make(recording))
+    assert twin is not None
+    effect = EFFECTS["hysteresis"]
+    forms = [f for f in effect.variants if "dot z" in f.equation and len(f.parts({}).nonlinear) == (2 if lean else 1)]
+    yielding, stiffness = 0.1, 20.0
+    searched = [yielding] if lean is None else [yielding, lean]
+    force = Force(forms[0], {"travel": (1.0,)}, np.array(searched), np.array([stiffness * yielding]), 0, "rate")
+    values = twin.values(Model(twin).start(recording))
+    inside = twin.packed([force], values)
+    u, whole = recording.inputs["command"], (np.zeros(1, np.int64), np.array([recording.n], np.int64))
+    sub, fine = twin.substeps(recording.dt, inside)
+
+    def slopes(t: float, s: np.ndarray) -> list[float]:
+        x, v, z = s
+        bend = v - (abs(v) * z + (lean or 0.0) * v * abs(z)) / yielding
+        return [v, float(np.interp(t, recording.t, u)) - 0.4 * v - 30.0 * x - stiffness * z, bend]
+
+    true = solve_ivp(slopes, (0.0, recording.t[-1]), np.zeros(3), t_eval=recording.t, rtol=1e-9, max_step=recording.dt)
+
+    def error(sub: int, fine: int) -> float:
+        drive = Drive(u[:, None].copy(), twin.held, recording.t, recording.dt, sub, fine, *whole)
+        limits = np.full(2, -np.inf), np.full(2, np.inf)
+        x = twin.equations.states(np.zeros((1, 2)), drive, values, inside, limits)[:, 0]
+        return float(np.max(np.abs(x - true.y[0])) / np.ptp(true.y[0]))
+
+    assert np.max(np.abs(true.y[2])) > 0.6 * yielding
+    assert sub * fine > sub
+    assert error(sub, fine) < 1.5 * error(sub * fine, 1) + 1e-6
+    assert error(sub, fine) < 1e-4
+    assert error(sub, 1) > 2.0 * error(sub, fine)

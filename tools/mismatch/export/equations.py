@@ -323,7 +323,7 @@ class EquationLines:
         if found.stiff:
             names.append("bristle")
             bend = bend_code(found.lean, "def bend(z, v, since):", "since")
-            lines += [f"stiff, bristle = {gain} * ({found.stiff}), 0.0", "", *bend]
+            lines += [f"stiff, bristle, bent = {gain} * ({found.stiff}), 0.0, 0.0", "", *bend]
         return names, lines
 
     def _step(self, place: Place | None, found: ForceCode) -> list[str]:
@@ -331,11 +331,11 @@ class EquationLines:
         sticks = place is not None and bool(found.limit) and not found.stiff
         lines: list[str] = []
         if place is not None and found.stiff:
-            i = place.velocity
             lines += [
-                "    def slope(t, s_, u, since):",
-                "        rates = derivatives(t, s_, u)",
-                f"        rates[{i}] -= stiff * bend(bristle, 0.5 * (s[{i}] + s_[{i}]), since)",
+                "    nonlocal bent", "",
+                "    def slope(t, s, u, since, mean):  # the bristle bends with the mean speed since the begin",
+                "        rates = derivatives(t, s, u)",
+                f"        rates[{place.velocity}] -= stiff * bend(bristle, mean, since)",
                 "        return rates", "",
             ]  # fmt: skip
         elif place is not None and sticks:
@@ -350,7 +350,11 @@ class EquationLines:
                 "        return rates", "",
             ]  # fmt: skip
         slope = "slope" if lines else "derivatives"
-        ends = [f", {part}" if found.stiff else "" for part in ("0.0", "h / 2", "h / 2", "h")]
+        ends = ["", "", "", ""]
+        if place is not None and found.stiff:
+            v = f"s[{place.velocity}]"
+            ends = [f", 0.0, {v}", f", h / 2, {v}"]
+            ends += [f", {since}, {v} + h / 2 * {r}[{place.velocity}]" for since, r in (("h / 2", "a"), ("h", "b"))]
         lines += [
             f"    a = {slope}(t, s, ua{ends[0]})",
             f"    b = {slope}(t + h / 2, s + h / 2 * a, ub{ends[1]})",
@@ -358,6 +362,19 @@ class EquationLines:
             f"    d = {slope}(t + h, s + h * c, uc{ends[3]})",
             "    z = s + h / 6 * (a + 2 * b + 2 * c + d)",
         ]
+        if place is not None and found.stiff:
+            i = place.velocity
+            lines += [
+                f"    mean = s[{i}] + h / 6 * (a[{i}] + b[{i}] + c[{i}])",
+                "    bent = bend(bristle, mean, h)",
+            ]
+            if self.substeps[1] > 1:
+                lines += [
+                    f"    turns = z[{i}] * np.sign(s[{i}]) < abs(z[{i}] - s[{i}])",
+                    f"    much = stiff * abs(bent - bristle) > {STEEP} * limit(mean, 1.0 if mean > 0 else -1.0)",
+                    "    if whole and (turns or much):  # in parts",
+                    "        return None",
+                ]
         if place is not None and sticks:
             i = place.velocity
             if self.substeps[1] > 1:
@@ -401,8 +418,7 @@ class EquationLines:
                 "    continue",
             ]
         if place is not None and found.stiff:
-            i = place.velocity
-            body.append(f"bristle = bend(bristle, 0.5 * (s[{i}] + z[{i}]), h)")
+            body.append("bristle = bent")
         if place is not None and found.radii:
             body.append(f"held = np.clip(held, z[{place.position}] - radii, z[{place.position}] + radii)")
         low = [s.lowest for s in self.twin.state_list]

@@ -334,9 +334,9 @@ class OdeTwin(Head):
         """Return the steps per sample, and the parts of a step in which a body may stick, slip or turn.
 
         There are four steps per radian of the fastest mode, two per radian of the stiffest memory (a power of two, so
-        that it seldom changes during a fit) and six per period of cogging. Where dry friction may stick, there are at
-        least two parts per sample and up to eight, for 32 per radian, because a part in which the velocity crosses zero
-        is of second order only.
+        that it seldom changes during a fit) and six per period of cogging. Where friction may stick, or a bristle
+        turn, there are at least two parts per sample and up to eight, for 32 per radian, because a part in which the
+        velocity crosses zero is of second order only.
         """
         fastest_per_s = inside.fastest_per_s or self.fastest_per_s
         sub, parts = int(np.ceil(dt * fastest_per_s / 0.25)), 1
@@ -347,8 +347,7 @@ class OdeTwin(Head):
                 sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
             if np.any(rows.friction[:3] != 0.0):
                 least = max(2, min(8, int(np.ceil(32 * dt * fastest_per_s))))
-                # a bristle bends in every step
-                sub, parts = (max(sub, least), parts) if rows.friction[5] > 0.0 else (sub, max(parts, least))
+                parts = max(parts, least)
             if rows.cogging[0] > 0.0 and position != velocity:
                 sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
         sub = int(np.clip(sub, 1, MOST_SUBSTEPS))

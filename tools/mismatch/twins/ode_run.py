@@ -22,7 +22,8 @@ MOST_LOG = 50.0
 """Largest logarithm of the factor of a parameter: a trial of the search must stay finite."""
 
 STEEP = 0.25
-"""Fall of friction with speed, times a step, above which the step is taken in parts."""
+"""Fall of friction with speed, times a step, above which the step is taken in parts; and the change of a bristle's
+force, as a share of its limit."""
 
 JOINT = 8 + SPRING
 """Number of columns of a joint: position, velocity and target of both sides, the ratio b of its travel x_1 - b x_2, the
@@ -96,6 +97,12 @@ def rates_of(code, x, u):
 
 
 @kernel
+def mean_speed(speeds, c):
+    """Return the mean over a step of a velocity of which ``speeds[:, c]`` are the values at its stages."""
+    return (speeds[0, c] + 2.0 * speeds[1, c] + 2.0 * speeds[2, c] + speeds[3, c]) / 6.0
+
+
+@kernel
 def run_equations(code, drive, packed, x0, limits):
     """Return states (n, s) of a free run from ``x0`` (starts, s) by fourth-order Runge-Kutta.
 
@@ -104,7 +111,9 @@ def run_equations(code, drive, packed, x0, limits):
     Dry friction is set-valued: within a step the direction of slip is fixed; where the velocity crosses zero the body
     rests while the other forces are within the limit, else the rest of the step is slip the other way (Karnopp, J. Dyn.
     Syst. Meas. Control 107, 1985, 100, without his band). That is of second order only, so that a step in which a body
-    begins to slip, or is slow enough to turn, is taken in ``fine`` parts.
+    begins to slip, or is slow enough to turn, is taken in ``fine`` parts. A bristle bends with the travel since the
+    begin of the step, which the stages give as they give a position; a step in which it turns or bends much is taken in
+    parts, too.
 
     The derivative is computed in one place of the loop and not in a function: a call that passes arrays counts
     references to each of them, which costs more than the equations.
@@ -125,7 +134,8 @@ def run_equations(code, drive, packed, x0, limits):
     x, y, z = np.zeros(s), np.zeros(s), np.zeros(s)
     rates = np.zeros((5, s))  # derivatives of the four stages, and the one that decides between slip and rest
     played = np.zeros(thresholds.size)
-    bristle = np.zeros((places, 2))  # deflection and velocity at the start of a step
+    bristle = np.zeros(places)  # deflection at the start of a step
+    speeds = np.zeros((4, places))  # velocities at the stages
     pushed = np.zeros(places)  # sum of all other forces at the start of a step
     crossed = np.zeros(places)
     mode = np.zeros(places, np.int64)  # direction of slip (+1, -1), 2 at rest, 0 without dry friction
@@ -144,7 +154,7 @@ def run_equations(code, drive, packed, x0, limits):
                 x[i] = x0[at, i]
             j = 0
             for q in range(places):
-                bristle[q, 0] = 0.0
+                bristle[q] = 0.0
                 for _ in range(counts[q]):
                     played[j] = x[place[q, 0]]
                     j += 1
@@ -159,7 +169,7 @@ def run_equations(code, drive, packed, x0, limits):
                 is_rough = False
                 if width > 1:
                     kept[:] = played
-                    bent[:] = bristle[:, 0]
+                    bent[:] = bristle
                 j = 0
                 # four stages, then each place where the step may have ended in rest
                 for turn in range(4 + places):
@@ -176,7 +186,7 @@ def run_equations(code, drive, packed, x0, limits):
                         v, vn = x[velocity], z[velocity]
                         row = q * FRICTION
                         if friction[row + 5] > 0.0:
-                            bristle[q, 0] = bristle_after(bristle[q, 0], 0.5 * (v + vn), h, friction, row)
+                            bristle[q] = bristle_after(bristle[q], mean_speed(speeds, q), h, friction, row)
                         decided = False
                         if mode[q] == 2:
                             z[velocity] = 0.0
@@ -242,13 +252,12 @@ def run_equations(code, drive, packed, x0, limits):
                             f -= memory[i] * min(max(p - played[i], -thresholds[i]), thresholds[i])
                         e += counts[c]
                         if friction[row + 5] > 0.0:
-                            deflection, since = bristle[c, 0], part
-                            if turn == 0:
-                                bristle[c, 1] = v
-                            elif turn > 3:
-                                since = 0.0
-                            mean = 0.5 * (bristle[c, 1] + v)
-                            f -= friction[row + 5] * bristle_after(deflection, mean, since, friction, row)
+                            deflection = bristle[c]
+                            if turn < 4:
+                                speeds[turn, c] = v
+                            if 0 < turn < 4:
+                                deflection = bristle_after(deflection, speeds[turn - 1, c], part, friction, row)
+                            f -= friction[row + 5] * deflection
                         rates[stage, place[c, 2]] += f
                     if turn == 0:
                         for c in range(places):
@@ -276,6 +285,17 @@ def run_equations(code, drive, packed, x0, limits):
                                 z[i] = x[i] + h / 6.0 * f
                             if width > 1:
                                 for c in range(places):
+                                    row = c * FRICTION
+                                    if friction[row + 5] > 0.0:
+                                        v, vn = x[place[c, 1]], z[place[c, 1]]
+                                        mean = mean_speed(speeds, c)
+                                        moved = bristle_after(bristle[c], mean, h, friction, row) - bristle[c]
+                                        most = friction_limit(mean, 1.0 if mean > 0.0 else -1.0, friction, row)
+                                        if (
+                                            vn * np.sign(v) < abs(vn - v)
+                                            or abs(moved) * friction[row + 5] > STEEP * most
+                                        ):
+                                            is_rough = True
                                     if mode[c] == 1 or mode[c] == -1:
                                         v, vn, row = x[place[c, 1]], z[place[c, 1]], c * FRICTION
                                         sign, fall = float(mode[c]), 0.0
@@ -305,7 +325,7 @@ def run_equations(code, drive, packed, x0, limits):
                 if is_rough:
                     until = done + width
                     played[:] = kept
-                    bristle[:, 0] = bent
+                    bristle[:] = bent
                     continue
                 done += width
                 for i in range(s):
