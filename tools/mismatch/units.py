@@ -69,6 +69,7 @@ _SYMBOLS = MappingProxyType(
         "Wh": (_d(m=2, kg=1, s=-2), 3600.0, 0.0, True),
         "Pa": (_d(m=-1, kg=1, s=-2), 1.0, 0.0, True),
         "bar": (_d(m=-1, kg=1, s=-2), 1e5, 0.0, True),
+        "barg": (_d(m=-1, kg=1, s=-2), 1e5, 0.0, True),  # a difference to the pressure around
         "psi": (_d(m=-1, kg=1, s=-2), 6894.757293168361, 0.0, False),
         "A": (_d(a=1), 1.0, 0.0, True),
         "C": (_d(s=1, a=1), 1.0, 0.0, True),
