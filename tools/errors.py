@@ -23,15 +23,18 @@ class RecordingError(InputError):
     """A recording, or its description, cannot be used. The message names file, key, line or sample, and what to do."""
 
 
-def refuse_unknown_keys(where: str, keys: Iterable[str], known: Iterable[str]) -> None:
-    """Raise ``RecordingError`` for the first of ``keys`` that is not ``known``; it names the most similar known key."""
+def refuse_unknown_keys(where: str, keys: Iterable[str], known: Iterable[str], what: str = "key") -> None:
+    """Raise ``RecordingError`` for the first of ``keys`` that is not ``known``; it names the most similar known key.
+
+    ``what`` is the word for a key in the message.
+    """
     allowed = list(known)
     for key in keys:
         if key in allowed:
             continue
         similar = get_close_matches(key, allowed, 1)
         advice = f"; write '{similar[0]}', or leave it out" if similar else "; leave it out"
-        raise RecordingError(f"{where} key '{key}' is unknown{advice}. Known keys: {', '.join(allowed)}")
+        raise RecordingError(f"{where} {what} '{key}' is unknown{advice}. Known {what}s: {', '.join(allowed)}")
 
 
 def missing_column(path: Path, name: str, have: Sequence[str]) -> RecordingError:

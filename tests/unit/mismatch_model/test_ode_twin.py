@@ -66,6 +66,11 @@ c = 0.3
         (("[twin.equations]", "[twin.outputs]\nangle = 'nobody'\n[twin.equations]"), "'nobody'"),
         (('kind = "ode"', 'kind = "ode"\nfunction = "x.py:f"'), "either equations, or function"),
         (("tau  = 0.08", "tau  = 0.08\nspeed = 1.0"), "names two things"),
+        (
+            ("tau  = 0.08", "tau  = 0.08\nfixed = ['tau', 'gian']"),
+            r"fixed: parameter 'gian' is unknown; write 'gain', or leave it out\. Known parameters: gain, tau",
+        ),
+        (("tau  = 0.08", "tau  = 0.08\nfixed = 'tau'"), "fixed must list parameters that stay as given, by"),
     ],
 )
 def test_what_cannot_be_used_is_said(tmp_path: Path, change: tuple[str, str], message: str) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
 from sim_devices.physics.parameter import OWN_SIGN, RATE_SIGN
-from tools.errors import RecordingError
+from tools.errors import RecordingError, refuse_unknown_keys
 from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
@@ -93,10 +93,9 @@ def _assembled(
     holds = read_holds(recording, STRAIGHT_OR_HELD)
     held = np.array([holds.get(s) == "zero" for s in signals])
     fixed = table.get("fixed", [])
-    if not isinstance(fixed, Sequence) or isinstance(fixed, str) or any(f not in names for f in fixed):
-        raise RecordingError(
-            f"{where} fixed must list parameters that stay as given ({', '.join(names)}), got {fixed!r}"
-        )
+    if not isinstance(fixed, Sequence) or isinstance(fixed, str) or not all(isinstance(f, str) for f in fixed):
+        raise RecordingError(f"{where} fixed must list parameters that stay as given, by their names; got {fixed!r}")
+    refuse_unknown_keys(f"{where} fixed:", fixed, names, "parameter")
     own_units = table.get("units", {})
     if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
         raise RecordingError(f"{where} units must give the unit of each parameter as text")
