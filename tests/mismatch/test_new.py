@@ -144,6 +144,9 @@ def test_a_twin_that_needs_more_says_so(tmp_path: Path):
     result = call(csv(tmp_path / "a.csv", "t_s,u_V,y_V", T, FORCE, X), "--twin", "state_space")
     assert result.exit_code == 0
     assert "the twin's A, B, C: a state_space needs them" in result.stderr
+    path = tmp_path / "recording.toml"
+    assert f"next: complete in {path} what could not be known, then: micron mismatch diagnose {path}" in result.stderr
+    assert "micron:" not in result.stderr
 
 
 def with_gaps(path: Path) -> Path:

@@ -250,13 +250,11 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
         f" the columns are drawn in {made.picture}",
         soft_wrap=True,
     )
-    if made.guess.unknown:
-        print_error(f"{made.path}: complete what could not be known:")
-        for one in made.guess.unknown:
-            console().print(f"  {one}", soft_wrap=True)
-        return
     path = shlex.quote(str(made.path))
-    console().print(f"next: write what you know into {path}, then: micron mismatch diagnose {path}", soft_wrap=True)
+    write = f"complete in {path} what could not be known" if made.guess.unknown else f"write what you know into {path}"
+    console().print(f"next: {write}, then: micron mismatch diagnose {path}", soft_wrap=True)
+    for one in made.guess.unknown:
+        console().print(f"  {one}", soft_wrap=True)
 
 
 def physics(
