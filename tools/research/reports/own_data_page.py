@@ -147,8 +147,8 @@ def derivatives(t, states, inputs, parameters):
 ```
 
 The function is called once, with symbols, and becomes equations. `math.sin`, Python's `max` and an `if` need numbers
-and fail. The file runs after `micron trust .`. A program that simulates by itself is
-[a twin of your own](adding/twin.md).
+and fail. The file runs after `micron trust .`; `simulate --trust` and `diagnose --trust` decide it as well. A program
+that simulates by itself is [a twin of your own](adding/twin.md).
 
 {si}
 Units of other dimensions stay as recorded, and so do degC and % (12 % is 12); an `ode` leaves degC as it is, too. Its
