@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -404,7 +405,7 @@ def simulate(
 
         loaded = load(recording or twin)
         for line in as_read(loaded):
-            console().print(line, highlight=False)
+            _print_read(line)
         left_out = columns_left_out(recording or twin)
         if left_out:
             more = f" and {len(left_out) - MOST_NAMED} more" if len(left_out) > MOST_NAMED else ""
@@ -423,6 +424,22 @@ def simulate(
         for row in rows:
             say.print(row.text(), highlight=False, soft_wrap=True)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
+
+
+def _print_read(line: str) -> None:
+    """Print a line of what was read. A list is broken between its items only: a name stays beside its value."""
+    out = console()
+    if line.startswith("note: "):
+        out.print(line)
+        return
+    row, *others = re.split(r"(?<=,) (?![^()]*\))", line)  # a comma in brackets belongs to its item
+    for item in others:
+        if len(row) + 1 + len(item) > out.width:
+            out.print(row, soft_wrap=True)
+            row = f"  {item}"
+        else:
+            row += f" {item}"
+    out.print(row, soft_wrap=True)
 
 
 for _command in (new, diagnose, apply, simulate, plan, watch, heal, cut, physics):  # in the order of their use

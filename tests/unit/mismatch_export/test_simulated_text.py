@@ -77,6 +77,17 @@ def test_the_parameters_are_printed_as_they_were_read(tmp_path: Path) -> None:
     assert "parameters: mass = 1" in as_read(load(_recorded(tmp_path, SLIDING, 0.0)))
 
 
+def test_a_parameter_is_not_broken_across_lines(tmp_path: Path) -> None:
+    numbers = {f"a_rather_long_name_{k}": 0.125 + k for k in range(9)}
+    text = SLIDING.replace('"mechanical_axis"', '"ode"\noutputs = { position = "a_rather_long_name_1 * force" }')
+    text = text.replace("mass = 1.0", "\n".join(f"{name} = {value}" for name, value in numbers.items()))
+    ran = CliRunner().invoke(app, ["mismatch", "simulate", str(_recorded(tmp_path, text, 0.0))])
+    assert ran.exit_code == 0, ran.output
+    lines = ran.stderr.splitlines()
+    assert all(any(f"{name} = {value:.6g}" in line for line in lines) for name, value in numbers.items())
+    assert max(len(line) for line in lines if "a_rather_long_name_" in line) <= 80
+
+
 def test_a_simulation_that_is_further_off_than_the_mean_is_said_to_be(tmp_path: Path) -> None:
     line, row = _simulated(_recorded(tmp_path, COLUMNS, 50.0))
     assert row["share"] > 1.0
