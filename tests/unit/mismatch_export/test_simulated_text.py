@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
 from tests.recording_text import channel
@@ -86,6 +88,49 @@ def test_a_parameter_is_not_broken_across_lines(tmp_path: Path) -> None:
     lines = ran.stderr.splitlines()
     assert all(any(f"{name} = {value:.6g}" in line for line in lines) for name, value in numbers.items())
     assert max(len(line) for line in lines if "a_rather_long_name_" in line) <= 80
+
+
+def _of_matrices(folder: Path, matrices: str, unit: str = "mm") -> list[str]:
+    text = """
+format = 1
+data = "data.csv"
+rate_hz = 10.0
+[twin]
+kind = "state_space"
+[twin.parameters]
+"""
+    text += matrices + channel("sim", "input", "drive", "mV") + channel("x", "output", "position", unit)
+    return [line for line in as_read(load(_recorded(folder, text, 0.0))) if line.startswith(("poles", "static"))]
+
+
+@pytest.mark.parametrize(
+    ("matrices", "poles", "gain"),
+    [
+        ("A = [[-0.5]]\nB = [[1.0]]\nC = [[2.0]]", "-0.5 1/s", "4 mm per mV"),
+        ("A = [[-0.5]]\nB = [[1.0]]\nC = [[2.0]]\nD = [[-3.0]]", "-0.5 1/s", "1 mm per mV"),
+        ("A = [[0, 1], [-100, -2]]\nB = [[0], [10]]\nC = [[1, 0]]", "1.592 Hz with damping 0.1", "0.1 mm per mV"),
+        ("A = [[0, 1], [0, -2]]\nB = [[0], [10]]\nC = [[1, 0]]", "0 1/s, -2 1/s", "integrates"),
+        ("A = [[0, 1], [0, -2]]\nB = [[0], [10]]\nC = [[0, 1]]", "0 1/s, -2 1/s", "5 mm per mV"),
+        ("A = [[0, 1], [0, 0]]\nB = [[0], [1]]\nC = [[1, 0]]", "0 1/s, 0 1/s", "integrates"),
+        ("A = [[0.9]]\nB = [[0.2]]\nC = [[1]]\ndiscrete = true", "-1.054 1/s", "2 mm per mV"),
+        ("A = [[1.0]]\nB = [[0.2]]\nC = [[1]]\ndiscrete = true", "0 1/s", "integrates"),
+        ("A = [[0.0]]\nB = [[0.2]]\nC = [[1]]\ndiscrete = true", "none", "0.2 mm per mV"),
+    ],
+)
+def test_matrices_are_printed_as_poles_and_static_gains(tmp_path: Path, matrices: str, poles: str, gain: str) -> None:
+    lines = [f"poles: {poles}", f"static gain: drive to position {gain}"]
+    assert _of_matrices(tmp_path, f"{matrices}\n") == lines
+
+
+def test_a_static_gain_is_in_the_units_of_the_file(tmp_path: Path) -> None:
+    """The matrices are in V and rad, the columns in mV and deg."""
+    matrices = f"A = [[-50.0]]\nB = [[{50e3 * math.radians(1.0)}]]\nC = [[1.0]]\n"
+    lines = ["poles: -50 1/s", "static gain: drive to position 1 deg per mV"]
+    assert _of_matrices(tmp_path, matrices, "deg") == lines
+
+
+def test_matrices_that_cannot_be_read_have_no_poles(tmp_path: Path) -> None:
+    assert _of_matrices(tmp_path, "A = [[-0.5, 1.0]]\nB = [[1.0]]\nC = [[2.0]]\n") == []
 
 
 def test_a_simulation_that_is_further_off_than_the_mean_is_said_to_be(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from sim_devices.physics.effect import Array
 from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
+from tools.mismatch.export.linear_text import linear_lines
 from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load, load_twin
@@ -79,7 +80,7 @@ def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual
 
 def as_read(recording: Recording) -> list[str]:
     """Return what was read of a recording, as lines: twin, clock, signals, holds where its kind has one, parameters,
-    notes.
+    poles and static gains of matrices, notes.
     """
     holds = declared_holds(recording)
     has_hold = "hold" in names(PARAMETERS.get(recording.twin.kind, ()))
@@ -100,7 +101,7 @@ def as_read(recording: Recording) -> list[str]:
     }
     if given:
         lines.append("parameters: " + ", ".join(f"{k} = {v:.6g}" for k, v in given.items()))
-    return [*lines, *(f"note: {note}" for note in recording.warnings)]
+    return [*lines, *linear_lines(recording), *(f"note: {note}" for note in recording.warnings)]
 
 
 def simulate_own(recording: Recording) -> dict[str, Array]:
