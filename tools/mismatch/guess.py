@@ -80,10 +80,11 @@ class GuessedColumn:
 class Guess:
     """Proposes a recording.
 
-    ``time_column`` is empty without one in seconds; ``rate_hz`` is None if unknown. ``kind`` is empty if no twin fits.
-    ``unknown`` lists what a person must supply before a diagnosis, ``broken`` what must be repaired first, ``assumed``
-    the assumptions that nothing confirms, ``notes`` the omissions with reasons. ``clock`` is the column of time in any
-    unit, ``clock_unit``; ``row_of_first`` is the line of the first sample of a text file, or 0.
+    ``time_column`` is empty without one, or where ``rate_hz`` stands for it; ``rate_hz`` is None if unknown. ``kind``
+    is empty if no twin fits. ``unknown`` lists what a person must supply before a diagnosis, ``broken`` what must be
+    repaired first, ``assumed`` the assumptions that nothing confirms, ``notes`` the omissions with reasons. ``clock``
+    is the column of time in any unit, ``clock_unit``; ``row_of_first`` is the line of the first sample of a text file,
+    or 0.
     """
 
     samples: int
@@ -225,15 +226,14 @@ def _names(path: Path) -> list[str]:
 
 def _time_of(clock: str, unit: str, stamps: Stamps, broken: list[str], notes: list[str]) -> tuple[str, float | None]:
     """Return the time column, empty where even steps in another unit than s become a rate, and the rate in Hz."""
-    time_column = clock if units.parse(unit).factor == 1.0 else ""
-    usable = stamps.is_usable if time_column else stamps.is_even
-    if not usable:
+    if not stamps.is_usable:
         broken.append(_broken_clock(clock, stamps))
-    elif not time_column:
+    elif stamps.is_even and units.parse(unit).factor != 1.0:
         notes.append(f"column '{clock}' is the time in {unit}: its even steps are written as rate_hz")
+        return "", stamps.rate_hz
     elif stamps.faults:
         notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
-    return time_column, stamps.rate_hz
+    return clock, stamps.rate_hz
 
 
 def place(sample: int, row_of_first: int) -> str:

@@ -10,6 +10,8 @@ from hal.arrays import Array
 from tools.mismatch.recording_clock import LONGEST_GAP, MOST_MISSING
 
 MOST_PLACES = 5
+_PART = 256
+"""Stamps of which the earliest and the latest, against an even grid, stand for all when the grid turns out steeper."""
 UNEVEN = 0.5
 """Steps that differ from the usual one by more than this share are counted as uneven."""
 
@@ -18,9 +20,10 @@ UNEVEN = 0.5
 class Stamps:
     """Summarises time stamps in seconds.
 
-    ``step_s``: the usual step; ``rate_hz``: None without a step. ``places``: the first ``MOST_PLACES`` faults, each
-    with its sample and time; ``faults``: how many there are. ``is_usable``: the loader takes the column as it is.
-    ``wander``: largest distance of a stamp from an even grid, in steps.
+    ``step_s``: the usual step; without a fault the mean one, because the usual one is rounded like the stamps.
+    ``rate_hz``: None without a step. ``places``: the first ``MOST_PLACES`` faults, each with its sample and time;
+    ``faults``: how many there are. ``is_usable``: the loader takes the column as it is. ``wander``: largest distance of
+    a stamp from the even grid between the first and the last, in steps, as the loader measures it.
     """
 
     step_s: float
@@ -50,7 +53,9 @@ class StampReader:
     _back: int = 0
     _faults: int = 0
     _places: list[str] = field(default_factory=list[str])
-    _off: tuple[float, float] = (0.0, 0.0)
+    _grid_step: float = 0.0
+    _off: list[Array] = field(default_factory=list[Array])
+    """Of each part: its middle sample, and its least and largest distance from a grid of ``_grid_step``."""
 
     def add(self, stamps: Array) -> None:
         """Take the next block, float64 (n,), in seconds."""
@@ -60,6 +65,8 @@ class StampReader:
             self._usual = float(np.median(forward)) if forward.size else 0.0
             self._begin = float(stamps[0])
             self._last = self._begin - self._usual
+            mean = float(stamps[-1] - stamps[0]) / max(stamps.size - 1, 1)
+            self._grid_step = mean if np.isfinite(mean) else self._usual
         with np.errstate(invalid="ignore"):
             steps = np.diff(stamps, prepend=self._last)
             long = steps > (1.0 + UNEVEN) * self._usual
@@ -68,9 +75,11 @@ class StampReader:
             self._longest = max(self._longest, float(np.nanmax(steps, initial=0.0)))
             self._back += int(np.sum(back | ~np.isfinite(steps)))
             bad = np.flatnonzero(long | back | ~np.isfinite(steps))
-            grid = self._begin + self._usual * (self._count + np.arange(stamps.size))
-            off = stamps - grid
-            self._off = (float(np.nanmin(off, initial=self._off[0])), float(np.nanmax(off, initial=self._off[1])))
+            sample = np.arange(self._count, self._count + stamps.size, dtype=np.float64)
+            off = stamps - (self._begin + self._grid_step * sample)
+            starts = np.arange(0, stamps.size, _PART)
+            middle = sample[np.minimum(starts + _PART // 2, stamps.size - 1)]
+            self._off.append(np.stack([middle, np.fmin.reduceat(off, starts), np.fmax.reduceat(off, starts)]))
         self._faults += bad.size
         for i in bad[: MOST_PLACES - len(self._places)]:
             self._places.append(self._place(int(i), float(steps[i]), float(stamps[i])))
@@ -93,8 +102,12 @@ class StampReader:
         span = self._last - self._begin
         gaps_matter = self._longest > LONGEST_GAP * self._usual or self._missing_s > MOST_MISSING * span
         is_usable = self._usual > 0 and not self._back and not (self._missing_s > 0 and gaps_matter)
-        wander = max(-self._off[0], self._off[1]) / self._usual if self._usual > 0 else float("inf")
         mean = span / (self._count - 1) if self._count > 1 and not self._faults else self._usual
-        return Stamps(
-            self._usual, 1.0 / mean if mean > 0 else None, tuple(self._places), self._faults, is_usable, wander
-        )
+        wander = self._wander(mean) if mean > 0 else float("inf")
+        return Stamps(mean, 1.0 / mean if mean > 0 else None, tuple(self._places), self._faults, is_usable, wander)
+
+    def _wander(self, step: float) -> float:
+        """Return the largest distance of a stamp from a grid of ``step`` behind the first one, in steps."""
+        middle, low, high = np.concatenate(self._off, axis=1)
+        shift = (step - self._grid_step) * middle
+        return float(max(np.nanmax(high - shift, initial=0.0), -np.nanmin(low - shift, initial=0.0))) / step

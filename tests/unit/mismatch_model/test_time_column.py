@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from tests.recording_text import stack_channels
-from tools.errors import RecordingError
+from tools.errors import InputError, RecordingError
 from tools.mismatch.guess import guess
+from tools.mismatch.new import new_recording
 from tools.mismatch.recording_clock import on_grid
 from tools.mismatch.recording_load import load
+from tools.mismatch.stamps import StampReader
 
 TEXT = """format = 1
 data = "data.npz"
@@ -61,6 +63,39 @@ def test_a_clock_in_hours_or_minutes_is_converted(tmp_path: Path, name: str, fac
     assert (proposed.clock, proposed.clock_unit) == (("", "s") if name == "x_min" else (name, unit))
 
 
+def test_rounded_stamps_are_even_for_new_as_they_are_for_simulate(tmp_path: Path) -> None:
+    """A sample a minute, in hours with 5 decimals: the usual difference is 60.01 s."""
+    k = np.arange(6000)
+    data = tmp_path / "data.csv"
+    table = np.column_stack([np.round((k + 1) / 60, 5), np.sin(0.03 * k), np.cos(0.03 * k)])
+    np.savetxt(data, table, delimiter=",", header="time_h,u_V,z_um", comments="", fmt="%.5f")
+    found = load(new_recording(data, kind="piezo_stack").path)
+    assert (found.n, found.dt) == (6000, pytest.approx(60.0, rel=1e-6))
+
+
+@pytest.mark.parametrize("step_s", [0.0027, 0.01 + 1e-5, 60.0])
+def test_the_grid_of_stamps_in_blocks_runs_from_the_first_to_the_last(step_s: float) -> None:
+    """Stamps in whole ms, or in steps of 0.036 s: their usual difference is not their step."""
+    unit_s = 0.036 if step_s == 60.0 else 0.001
+    t = np.asarray(np.round(step_s * np.arange(200_000) / unit_s) * unit_s, np.float64)
+    reader = StampReader()
+    for part in np.split(t, [65536, 131072]):
+        reader.add(part)
+    stamps = reader.stamps()
+    assert stamps.is_even
+    assert stamps.wander < 1.1 * unit_s / step_s
+    assert stamps.rate_hz == pytest.approx(1 / step_s, rel=1e-6)
+
+
+def test_a_clock_that_wanders_is_not_even_in_blocks() -> None:
+    k = np.arange(200_000)
+    reader = StampReader()
+    for part in np.split(0.01 * k + 0.02 * np.sin(2 * np.pi * k / k.size), [65536, 131072]):
+        reader.add(part)
+    assert not reader.stamps().is_even
+    assert reader.stamps().wander == pytest.approx(2.0, rel=0.02)
+
+
 def test_a_long_gap_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="jumps by 2"):
         load(write(tmp_path, np.delete(np.arange(1000) * 0.01, slice(400, 600))))
@@ -95,3 +130,21 @@ def test_a_time_in_ms_under_a_bare_name_is_noticed(tmp_path: Path, kind: str, is
     notes = [note for note in load(tmp_path).warnings if "if the column is in ms" in note.lower()]
     assert len(notes) == is_in_ms
     assert all("rate_hz = 100 in place of time_column" in note for note in notes)
+
+
+@pytest.mark.parametrize(("name", "unit_s"), [("t_s", 1.0), ("t_h", 3600.0)])
+def test_new_takes_the_stamps_that_simulate_takes(tmp_path: Path, name: str, unit_s: float) -> None:
+    """Short gaps are filled in either unit, long ones are refused by both."""
+    k = np.arange(1000)
+    columns = {"u": np.sin(0.03 * k), "z": np.cos(0.03 * k)}
+
+    def data_without(missing: slice) -> Path:
+        path = tmp_path / f"{missing.stop}.npz"
+        np.savez(path, **{n: np.delete(x, missing) for n, x in {name: 60.0 * k / unit_s, **columns}.items()})  # pyright: ignore[reportArgumentType]
+        return path
+
+    assert guess(data_without(slice(400, 404)), "piezo_stack").time_column == name
+    found = load(new_recording(data_without(slice(400, 404)), kind="piezo_stack").path)
+    assert (found.n, found.dt) == (1000, pytest.approx(60.0))
+    with pytest.raises(InputError, match="jumps by"):
+        new_recording(data_without(slice(400, 600)), kind="piezo_stack", force=True)
