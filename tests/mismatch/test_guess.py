@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tools.errors import RecordingError
+from tools.mismatch.column_course import course_of
 from tools.mismatch.guess import POINTS, guess, main
 from tools.mismatch.guess_roles import guess_role, split_unit
 from tools.mismatch.new import new_recording
@@ -78,6 +80,77 @@ def test_a_temperature_answers_where_nothing_else_could(tmp_path: Path):
     found = guess(table(tmp_path, header, t, np.sin(t), 20 + 0.1 * t, 30 + np.cos(t)))
     assert [c.role for c in found.columns] == ["time", "input", "context", "output"]
     assert "outputs are 'block temperature (degC)'" in found.assumed
+
+
+N = 3000
+K = np.arange(N)
+RNG = np.random.default_rng(0)
+NOISE = RNG.normal(size=(3, N))
+DUTY = np.repeat(RNG.permutation(np.tile([0.2, 0.4, 0.5, 0.8], 5)), 150)
+
+
+def lag(u: np.ndarray, keep: float) -> np.ndarray:
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], u), np.float64)
+
+
+def roles_of(folder: Path, header: str, *columns: np.ndarray) -> tuple[dict[str, str], list[str]]:
+    path = folder / "data.csv"
+    np.savetxt(path, np.column_stack([0.01 * K, *columns]), delimiter=",", header=header, comments="", fmt="%.6g")
+    found = guess(path)
+    return {c.name: c.role for c in found.columns[1:]}, found.assumed
+
+
+def test_a_staircase_drives_and_noisy_columns_answer_whatever_their_units(tmp_path: Path):
+    current, voltage = 3 * lag(DUTY, 0.9) + 0.02 * NOISE[0], 12 * lag(DUTY, 0.97) + 0.03 * NOISE[1]
+    roles, assumed = roles_of(tmp_path, "t_s,duty,iL_A,vout_V,sink_degC", DUTY, current, voltage, 20 + 1e-3 * K)
+    assert roles == {"duty": "input", "iL_A": "output", "vout_V": "output", "sink_degC": "context"}
+    assert assumed[:3] == ["inputs are 'duty'", "outputs are 'iL_A'", "context is 'sink_degC'"]
+
+
+@pytest.mark.parametrize("laser", [np.minimum(K // 500, 5), DUTY])
+@pytest.mark.parametrize("angle", [np.abs(0.36 * K % 720 - 360), (0.377 * K) % 360, 90 * np.sin(0.01 * K)])
+def test_a_staircase_and_a_sweep_drive_a_noisy_detector(tmp_path: Path, laser: np.ndarray, angle: np.ndarray):
+    detected = laser * np.cos(np.radians(angle)) ** 2 + 0.01 * NOISE[0]
+    roles, assumed = roles_of(tmp_path, "t_s,laser_mW,analyser_deg,detector_V", laser, angle, detected)
+    assert roles == {"laser_mW": "input", "analyser_deg": "input", "detector_V": "output"}
+    assert "inputs are 'laser_mW', 'analyser_deg'" in assumed
+    assert "outputs are 'detector_V'" in assumed
+
+
+def test_every_staircase_drives(tmp_path: Path):
+    feed = np.repeat(np.tile([5.0, 20.0, 10.0], 4), 250)
+    substrate, cells = 3 * lag(feed, 0.99) + 0.05 * NOISE[0], lag(DUTY, 0.99) + 0.01 * NOISE[1]
+    roles, _ = roles_of(tmp_path, "time_h,dosing_l/min,feed_g/l,substrate_g/l,cells_g/l", DUTY, feed, substrate, cells)
+    assert list(roles.values()) == ["input", "input", "output", "output"]
+
+
+def test_without_names_and_units_a_noisy_column_answers(tmp_path: Path):
+    roles, _ = roles_of(tmp_path, "t_s,a,b", lag(DUTY, 0.9) + 0.02 * NOISE[0], np.sin(0.01 * K))
+    assert roles == {"a": "output", "b": "input"}
+
+
+def test_an_encoder_that_is_smoother_than_the_current_still_answers(tmp_path: Path):
+    current = np.sin(0.01 * K)
+    roles, _ = roles_of(tmp_path, "t_s,iq_A,shaft_deg", current + 0.05 * NOISE[0], np.round(np.cumsum(current), 2))
+    assert roles == {"iq_A": "input", "shaft_deg": "output"}
+
+
+@pytest.mark.parametrize(
+    ("values", "course"),
+    [
+        (DUTY, "held"), (1.0 * (K > 500), "held"), (np.repeat(np.arange(6.0), 500), "held"),
+        (np.sin(0.01 * K), "smooth"), (np.round(np.sin(0.01 * K), 3), "smooth"), (0.36 * K % 360, "smooth"),
+        (np.sin(0.01 * K).astype(np.float32), "smooth"), (np.round(50 * np.sin(0.002 * K)) * 0.044, "smooth"),
+        (np.sin(0.01 * K) + 0.01 * NOISE[0], "noisy"), (0.36 * K + 0.05 * NOISE[0], "noisy"), (NOISE[0], "noisy"),
+        (np.round(3 * np.sin(0.002 * K) + 0.2 * NOISE[0]), ""),
+        (RNG.integers(0, 2, N) * 5.0, ""),
+        (np.zeros(N), ""), (np.full(N, np.nan), ""), (np.arange(5.0), ""),
+    ],
+)  # fmt: skip
+def test_the_course_of_a_column_is_told_by_its_values_in_any_unit(values: np.ndarray, course: str):
+    """A reading that rounding hides, and a switch, are neither."""
+    for scale in (1.0, 1e-9, 4.9e6):
+        assert course_of(np.asarray(scale * values, np.float64)) == course
 
 
 def test_columns_that_neither_drive_nor_answer_are_named_with_what_to_do(tmp_path: Path):

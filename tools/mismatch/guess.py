@@ -1,9 +1,9 @@
 """Guesses what the columns of a data file are: time, input, output or context, signal and unit, and the kind of twin.
 
 A guess is a proposal that a person corrects; it lists what it could not know. Units are read from the names of columns
-(``force_N``, ``x [mm]``) or a row of units, roles from names and units. The bench page and ``micron mismatch new``
-share it. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a descriptor and
-builds its twin as ``micron mismatch diagnose`` would, and prints nothing where both are good.
+(``force_N``, ``x [mm]``) or a row of units, roles from names, values and units. The bench page and ``micron mismatch
+new`` share it. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a
+descriptor and builds its twin as ``micron mismatch diagnose`` would, and prints nothing where both are good.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ import numpy as np
 
 from tools.errors import InputError, RecordingError
 from tools.mismatch import units
+from tools.mismatch.column_course import Course, course_of
 from tools.mismatch.guess_roles import (
     Assignment,
     GuessedRole,
     Parts,
     assign,
     choose_kinds,
+    roles_by_values,
     simulated_courses,
     split_clock,
     split_unit,
@@ -111,6 +113,8 @@ class _Column:
     first_missing: int = -1
     smallest: float = float("inf")
     largest: float = float("-inf")
+    course: Course = ""
+    """The course in the first block in which the values change."""
 
     def add(self, values: Array, at: int, parts: int) -> None:
         finite = np.isfinite(values)
@@ -119,6 +123,8 @@ class _Column:
                 self.first_missing = at + int(np.argmin(finite))
             self.missing += int(values.size - finite.sum())
         low, high = extremes(values, parts)
+        if not self.smallest < self.largest:
+            self.course = course_of(values)
         self.low.append(low)
         self.high.append(high)
         self.smallest = min(self.smallest, float(np.nanmin(low, initial=np.inf)))
@@ -149,12 +155,13 @@ def guess(path: Path, kind: str = "") -> Guess:
             f" answers{remarks}"
         )
     given = kind
-    kinds = [kind] if kind else choose_kinds(left, parts)
+    by_values = roles_by_values({k: seen[k].course for k in left}, parts)
+    kinds = [kind] if kind else choose_kinds(left, parts, by_values)
     kind = kinds[0] if len(kinds) == 1 else ""
     if kind == "columns":  # the unit of a simulated course is that of its output, where its name has none
         courses = simulated_courses(left, parts)
         parts |= {k: parts[of] for k, of in courses.items() if of and not parts[k][1]}
-    found = assign(kind, left, parts)
+    found = assign(kind, left, parts, by_values)
     if found is None and given and not _is_open(given):
         raise RecordingError(f"{path}: no columns are an input and an output of a {given}; {_words_of(given)}")
     if found is None:

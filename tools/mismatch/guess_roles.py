@@ -1,4 +1,4 @@
-"""Guesses roles, signals and units of columns, and the kind of twin, from names and units alone."""
+"""Guesses roles, signals and units of columns, and the kind of twin, from names, courses of values and units."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from tools.mismatch import units
+from tools.mismatch.column_course import Course, roles_of_courses
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS, Role, vocabulary
 
 GuessedRole = Literal["time", "input", "output", "context", ""]
@@ -119,23 +120,39 @@ def guess_role(name: str, unit: str) -> GuessedRole:
     return ""
 
 
-def choose_kinds(names: Sequence[str], parts: Parts) -> list[str]:
-    """Return the kinds of twins whose vocabulary takes most columns by name or unit, both ways; several fit equally."""
+def roles_by_values(courses: Mapping[str, Course], parts: Parts) -> dict[str, GuessedRole]:
+    """Return the roles that the courses of columns tell, where neither name nor unit says that a column is context."""
+    named = {name: role_of_name(parts[name][0]) for name in courses}
+    by_unit = {name: guess_role(*parts[name]) for name in courses}
+    asked = [name for name in courses if "context" not in (named[name], by_unit[name])]
+    return {**roles_of_courses({name: courses[name] for name in asked}, named, by_unit)}
+
+
+def choose_kinds(names: Sequence[str], parts: Parts, by_values: Mapping[str, GuessedRole]) -> list[str]:
+    """Return the kinds of twins whose vocabulary takes most columns by name or unit, both ways; several fit equally.
+
+    A kind that would drive what ``by_values`` is a reading, or answer with a command, does not fit.
+    """
     fits: dict[str, int] = {}
     for kind, words in KINDS.items():
-        if not words.open_ended and (found := assign(kind, names, parts, by_order=False)) is not None:
+        if words.open_ended or (found := assign(kind, names, parts, by_values, by_order=False)) is None:
+            continue
+        if all(found.roles[name] in (role, "context", "") for name, role in by_values.items()):
             fits[kind] = found.named
     return [kind for kind, named in fits.items() if named == max(fits.values())]
 
 
-def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True) -> Assignment | None:
+def assign(
+    kind: str, names: Sequence[str], parts: Parts, by_values: Mapping[str, GuessedRole], *, by_order: bool = True
+) -> Assignment | None:
     """Give every column a role and a signal of a twin of ``kind``; None if no input or no output remains.
 
-    With ``by_order``, columns without a telling name or unit take the free places in their order.
+    ``by_values``: the roles of ``roles_by_values``. With ``by_order``, columns without a telling name or unit take the
+    free places by their values, else in their order.
     """
     words = vocabulary(kind) if kind else None
     if words is None or words.open_ended:
-        return _assign_freely(kind, names, parts)
+        return _assign_freely(kind, names, parts, by_values)
     found = _Places(kind, parts)
     hints: dict[str, GuessedRole] = {name: role_of_name(parts[name][0]) for name in names}
     for name in names:  # the twin's own words
@@ -155,7 +172,7 @@ def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True)
             if name not in found.roles and not parts[name][1] and hints[name] != "context":
                 before = len(found.roles)
                 turn: GuessedRole = "output" if "input" in found.roles.values() else "input"
-                found.take_if(name, hints[name] or turn, lambda *_: True)
+                found.take_if(name, hints[name] or by_values.get(name, turn), lambda *_: True)
                 if len(found.roles) > before:
                     assumed.append(f"'{name}' is {_article(found.roles[name])}, {found.signals[name]}")
     dropped = found.drop_what_does_not_fit()
@@ -268,9 +285,12 @@ def simulated_courses(names: Sequence[str], parts: Parts) -> dict[str, str]:
     return found
 
 
-def _assign_freely(kind: str, names: Sequence[str], parts: Parts) -> Assignment | None:
-    """Assign roles for a twin that takes any signal: by name, else the first column drives and the others answer."""
-    roles: dict[str, GuessedRole] = {name: guess_role(*parts[name]) for name in names}
+def _assign_freely(
+    kind: str, names: Sequence[str], parts: Parts, by_values: Mapping[str, GuessedRole]
+) -> Assignment | None:
+    """Assign roles for a twin that takes any signal: by name, values or unit, else the first column drives and the
+    others answer."""
+    roles: dict[str, GuessedRole] = {name: by_values.get(name) or guess_role(*parts[name]) for name in names}
     courses = simulated_courses(names, parts) if kind == "columns" else {}
     simulated = {name: output for name, output in courses.items() if output}
     roles |= {name: "input" if output else "context" for name, output in courses.items()}
@@ -283,15 +303,16 @@ def _assign_freely(kind: str, names: Sequence[str], parts: Parts) -> Assignment 
             used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
-    named_roles = dict(roles)
     for role, name in (("input", used[0]), ("output", used[-1])):
         if role not in (roles[k] for k in used):
             free = next((k for k in (used if role == "input" else used[::-1]) if not roles[k]), name)
             roles[free] = "input" if role == "input" else "output"
     for name in used:
         roles[name] = roles[name] or "output"
-    guessed = {role: [k for k in used if roles[k] == role != named_roles[k]] for role in ("input", "output")}
-    assumed = [f"{role}s are {_quoted(of)}" for role, of in guessed.items() if of]
+    sure = {name for name in names if role_of_name(parts[name][0]) == roles[name]} | {*courses}
+    phrases = {"input": "inputs are", "output": "outputs are", "context": "context is"}
+    guessed = {phrase: [k for k in names if roles[k] == role and k not in sure] for role, phrase in phrases.items()}
+    assumed = [f"{phrase} {_quoted(of)}" for phrase, of in guessed.items() if of]
     signals: dict[str, str] = {}
     for name in names:
         plain, unit = parts[name]
