@@ -173,6 +173,37 @@ def test_a_simulated_column_is_the_course_of_its_output(tmp_path: Path, simulate
     assert load(made.path).twin.kind == "columns"
 
 
+@pytest.mark.parametrize(
+    ("recorded", "simulated", "unit"),
+    [
+        ("vout_V", "vout_sim_V", "V"), ("out_V", "out_V_simulated", "V"), ("x_mm", "sim_x_mm", "mm"),
+        ("x_mm", "x_um_model", "um"), ("Speed (rpm)", "Speed model (rad/s)", "rad/s"), ("x [mm]", "x (sim) [mm]", "mm"),
+        ("y", "model_y", ""), ("plant.x_mm", "plant.sim.x_mm", "mm"),
+    ],
+)  # fmt: skip
+def test_a_pair_of_a_recorded_and_a_simulated_column_is_found_without_a_word(
+    tmp_path: Path, recorded: str, simulated: str, unit: str
+):
+    data = table(tmp_path, f"t_s,duty,{recorded},{simulated},coil_A", 0.01 * K, DUTY, NOISE[0], NOISE[1], NOISE[2])
+    found = guess(data)
+    assert found.kind == "columns"
+    assert not found.unknown
+    assert [c.role for c in found.columns] == ["time", "input", "output", "input", "context"]
+    assert (found.columns[3].signal, found.columns[3].unit) == (f"simulated_{found.columns[2].signal}", unit)
+    assert (
+        f"the kind of twin is columns, because '{simulated}' is the simulated course of '{recorded}';"
+        " for another repeat with --twin KIND"
+    ) in found.assumed
+    assert "column 'coil_A' is context: no column is its simulated course" in found.notes
+    assert load(new_recording(data).path).twin.kind == "columns"
+
+
+@pytest.mark.parametrize("other", ["model_mm", "sim_x_V", "y_sim_mm", "simple_x_mm"])
+def test_a_name_with_another_stem_or_dimension_is_no_pair(tmp_path: Path, other: str):
+    found = guess(table(tmp_path, f"t_s,force_N,x_mm,{other}", 0.01 * K, DUTY, NOISE[0], NOISE[1]))
+    assert found.kind != "columns"
+
+
 def test_an_output_without_a_simulated_course_is_asked_for(tmp_path: Path):
     t = np.arange(300) / 100.0
     data = table(tmp_path, "t_s,pump_V,level [mm],sim_height [mm]", t, np.sin(t), np.cos(t), np.cos(t))

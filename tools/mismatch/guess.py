@@ -30,6 +30,7 @@ from tools.mismatch.guess_roles import (
     choose_kinds,
     roles_by_values,
     simulated_courses,
+    simulated_unit,
     split_clock,
     split_unit,
     word,
@@ -156,11 +157,11 @@ def guess(path: Path, kind: str = "") -> Guess:
         )
     given = kind
     by_values = roles_by_values({k: seen[k].course for k in left}, parts)
-    kinds = [kind] if kind else choose_kinds(left, parts, by_values)
+    pairs = {k: of for k, of in simulated_courses(left, parts).items() if of}
+    kinds = [kind] if kind else ["columns"] if pairs else choose_kinds(left, parts, by_values)
     kind = kinds[0] if len(kinds) == 1 else ""
     if kind == "columns":  # the unit of a simulated course is that of its output, where its name has none
-        courses = simulated_courses(left, parts)
-        parts |= {k: parts[of] for k, of in courses.items() if of and not parts[k][1]}
+        parts |= {k: (parts[k][0], simulated_unit(k, parts) or parts[of][1]) for k, of in pairs.items()}
     found = assign(kind, left, parts, by_values)
     if found is None and given and not _is_open(given):
         raise RecordingError(f"{path}: no columns are an input and an output of a {given}; {_words_of(given)}")
@@ -179,7 +180,10 @@ def guess(path: Path, kind: str = "") -> Guess:
             for o in outputs
             if f"simulated_{o}" not in found.signals.values()
         ]
-    if kind and not given and not any(word(parts[k][0]) == found.signals.get(k) for k in left):
+    if kind == "columns" and not given:
+        courses = ", ".join(f"'{k}' is the simulated course of '{of}'" for k, of in pairs.items())
+        assumed.append(f"the kind of twin is columns, because {courses}; for another repeat with --twin KIND")
+    elif kind and not given and not any(word(parts[k][0]) == found.signals.get(k) for k in left):
         assumed.append(f"the kind of twin is {kind}, by its units alone; for another repeat with --twin KIND")
     bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
     if bare:

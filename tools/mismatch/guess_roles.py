@@ -35,7 +35,10 @@ _WORDS: tuple[tuple[GuessedRole, str], ...] = (
 )
 _SURROUNDINGS = r"supply|ambient|room|humid|status|flag|state"
 """Names of context that stay context where no other column could answer."""
-_SIMULATED = re.compile(r"^(?:sim(?:ulated)?_(?P<behind>.+)|(?P<before>.+)_sim(?:ulated)?)$", re.IGNORECASE)
+_SIMULATED = re.compile(
+    r"^(?:sim(?:ulated)?|model)[_\W]+|[_\W]+(?:sim(?:ulated)?|model)(?:[)\]]|(?=[_\W]|$))", re.IGNORECASE
+)
+"""The word that makes a column a simulated one, with what parts it from the rest of the name."""
 _LETTERS: tuple[tuple[GuessedRole, str], ...] = (("input", r"u(\d|_|[A-Z]|$)"), ("output", r"y(\d|_|[A-Z]|$)"))
 """The letters of system identification: ``u``, ``u1``, ``uEst``, ``y_val``."""
 _BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
@@ -273,16 +276,24 @@ class _Places:
 def simulated_courses(names: Sequence[str], parts: Parts) -> dict[str, str]:
     """Return the columns of simulated output, by name (``sim_x_mm``), each with the column of that output (``x_mm``).
 
-    The output is empty where no column has the rest of the name.
+    The output is empty where no column of the same dimension has the rest of the name.
     """
+    rests = {name: rest for name in names if (rest := _SIMULATED.sub("", name, count=1)) not in (name, "")}
+    others = [name for name in names if name not in rests]
+    by_word = {word(parts[name][0]).lower(): name for name in others} | {word(name).lower(): name for name in others}
     found: dict[str, str] = {}
-    by_word = {word(parts[name][0]).lower(): name for name in names} | {word(name).lower(): name for name in names}
-    for name in names:
-        for own in (word(parts[name][0]), word(name)):  # 'x_mm_simulated' has its unit inside
-            match = _SIMULATED.match(own)
-            if match is not None:
-                found[name] = found.get(name) or by_word.get((match["behind"] or match["before"]).lower(), "")
+    for name, rest in rests.items():
+        wanted = (word(rest).lower(), word(split_unit(rest)[0]).lower())
+        output = next((by_word[own] for own in wanted if own in by_word), "")
+        unit = simulated_unit(name, parts)
+        is_alike = not output or not unit or not parts[output][1] or units.same_dimension(unit, parts[output][1])
+        found[name] = output if is_alike else ""
     return found
+
+
+def simulated_unit(name: str, parts: Parts) -> str:
+    """Return the unit of a simulated column, which may stand before the word for it (``x_mm_simulated``)."""
+    return parts[name][1] or split_unit(_SIMULATED.sub("", name, count=1))[1]
 
 
 def _assign_freely(
@@ -308,7 +319,10 @@ def _assign_freely(
             free = next((k for k in (used if role == "input" else used[::-1]) if not roles[k]), name)
             roles[free] = "input" if role == "input" else "output"
     for name in used:
-        roles[name] = roles[name] or "output"
+        roles[name] = roles[name] or ("input" if simulated else "output")
+    alone = [name for name in used if simulated and roles[name] == "output" and name not in simulated.values()]
+    roles |= dict.fromkeys(alone, "context")
+    notes = tuple(f"column '{name}' is context: no column is its simulated course" for name in alone)
     sure = {name for name in names if role_of_name(parts[name][0]) == roles[name]} | {*courses}
     phrases = {"input": "inputs are", "output": "outputs are", "context": "context is"}
     guessed = {phrase: [k for k in names if roles[k] == role and k not in sure] for role, phrase in phrases.items()}
@@ -320,7 +334,7 @@ def _assign_freely(
         signals[name] = _unused(own, signals)
     for name, output in simulated.items():
         signals[name] = f"simulated_{signals[output]}"
-    return Assignment(roles, signals, sum(bool(guess_role(*parts[k])) for k in used), (), tuple(assumed))
+    return Assignment(roles, signals, sum(bool(guess_role(*parts[k])) for k in used), notes, tuple(assumed))
 
 
 def word(plain: str) -> str:

@@ -162,7 +162,7 @@ taken, with a note. The equation of an encoder's output holds its counts:
 `mechanical_axis` with the input `torque` turns; with `force` it slides.
 
 A `columns` twin is a column of simulated output. It is an input, and `simulated_` stands before the output's name;
-`new --twin columns` finds `sim_x_mm` and `x_mm_simulated`. Only scale and offset are re-fitted: a wrong time constant
+`new` finds `sim_x_mm`, `x_model_mm` and `x_mm_simulated`. Only scale and offset are re-fitted: a wrong time constant
 appears as an effect.
 
 ``` { .toml title="columns" }
