@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tools.cli.bench_option import bench_path
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
+from tools.cli.common import (
+    Exit,
+    JsonOption,
+    check_picture,
+    clear_errors,
+    console,
+    data_console,
+    print_error,
+    print_note,
+)
 from tools.cli.mismatch_heal import heal
 from tools.cli.mismatch_plan import plan, read_report
 from tools.cli.mismatch_watch import watch
@@ -384,7 +393,11 @@ def simulate(
     recording: Annotated[
         Path | None, typer.Argument(metavar="[RECORDING]", help="A recording (folder or .toml) for the corrected twin.")
     ] = None,
+    *,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
+    image: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE", help="Picture of recorded, simulated and residual.")
+    ] = None,
     json_file: JsonOption = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
@@ -393,11 +406,13 @@ def simulate(
 
     Example: micron mismatch simulate twin.py rec --out simulated.csv
 
-    The recording's own twin, and what was read of the recording: micron mismatch simulate rec
+    The recording's own twin, and what was read of the recording: micron mismatch simulate rec --picture rec.png
     """
     with clear_errors():
-        check_writable(out, json_file, reads=[twin, recording])
+        check_picture(image)
+        check_writable(out, image, json_file, reads=[twin, recording])
         decide_on([twin, recording or twin], trust, allow_outside)
+        from tools.mismatch.export.picture import save_run
         from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import columns_left_out, load
@@ -420,6 +435,8 @@ def simulate(
         rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
             write_text_atomic(out, columns(loaded, simulated))
+        if image is not None:
+            save_run(loaded, simulated, image)
         say = data_console(json_file)
         for row in rows:
             say.print(row.text(), highlight=False, soft_wrap=True)

@@ -1,6 +1,7 @@
 """``micron mismatch``: what goes to which stream, exit codes, bad input, nothing half written."""
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -309,6 +310,17 @@ def test_simulate_of_a_recording_runs_its_own_twin_and_says_what_was_read(stack:
     assert row["share"] == pytest.approx(row["rms"] / float(np.std(loaded.outputs[o])))
     assert f"samples: 300 at {1 / loaded.dt:g} Hz" in result.stderr
     assert "inputs: command (V, hold" in result.stderr
+
+
+def test_simulate_draws_recorded_simulated_and_residual(stack: Path, tmp_path: Path):
+    result = run("simulate", stack, "--picture", tmp_path / "run.svg")
+    assert result.exit_code == 0
+    drawn = (tmp_path / "run.svg").read_text()
+    assert "<!-- recorded less simulated -->" in drawn
+    assert {"<!-- recorded -->", "<!-- simulated -->"} <= set(re.findall("<!-- [a-z]+ -->", drawn))
+    refused = run("simulate", stack, "--picture", tmp_path / "run.txt")
+    assert refused.exit_code == 2
+    assert "a picture ends in" in refused.stderr
 
 
 def test_simulate_of_no_recording_is_bad_input(tmp_path: Path):
