@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
 
 from sim_devices.physics.drift import local_level, local_slope, predict_walk
+from tools.mismatch.infer.density import predictable
 
 
 def _walk(n: int, dt: float, per_root_s: float, noise: float, seed: int = 3) -> np.ndarray:
@@ -72,3 +77,14 @@ def test_a_smooth_trend_has_the_likelihood_of_its_joint_normal_distribution() ->
     d = y[1:] - y[0]
     joint = -0.5 * (d @ np.linalg.solve(cov, d) + logdet + (n - 1) * np.log(2 * np.pi))
     assert norm.logpdf(error[1:], scale=deviation[1:]).sum() == pytest.approx(joint, rel=1e-6)
+
+
+def test_a_model_that_diverges_where_it_is_scored_follows_no_law_of_noise() -> None:
+    e = np.random.default_rng(1).standard_normal(600)
+    rows: Any = SimpleNamespace(fit_rows=np.arange(0, 300), held_rows=np.arange(310, 600))
+    white = predictable(rows, e)
+    assert 0.0 <= white < 0.02
+    for outside in (np.nan, np.inf):
+        assert predictable(rows, np.where(np.arange(600) == 305, outside, e)) == pytest.approx(white, abs=0.01)
+        assert predictable(rows, np.where(np.arange(600) == 400, outside, e)) == math.inf
+        assert predictable(rows, np.where(np.arange(600) == 20, outside, e)) == math.inf

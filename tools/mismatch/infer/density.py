@@ -99,8 +99,12 @@ COLOUR = 8
 def predictable(problem: Problem, e: Array) -> float:
     """Return the nats per held-out sample by which an autoregression improves the prediction errors ``e`` (m,).
 
-    It is learned on the fitted samples. Innovations are white if the law of the noise holds.
+    It is learned on the fitted samples. Innovations are white if the law of the noise holds. Errors that are not finite
+    where they count, of a model that diverges there, obey no law: then the improvement is infinite.
     """
+    if not np.all(np.isfinite(e[np.r_[problem.fit_rows, problem.held_rows]])):
+        return math.inf
+    e = np.where(np.isfinite(e), e, 0.0)
     limit = 6.0 * robust_scale(e[problem.fit_rows], 1e-300)
     e = np.clip(e, -limit, limit)
     learned = np.zeros(e.size, np.bool_)
