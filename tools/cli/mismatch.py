@@ -409,8 +409,8 @@ def simulate(
     The recording's own twin, and what was read of the recording: micron mismatch simulate rec --picture rec.png
     """
     with clear_errors():
-        check_picture(image)
         check_writable(out, image, json_file, reads=[twin, recording])
+        check_picture(image)
         decide_on([twin, recording or twin], trust, allow_outside)
         from tools.mismatch.export.picture import save_run
         from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
