@@ -77,7 +77,7 @@ def by_hand(x0: Array, torque: Array, numbers: tuple[float, ...], friction: floa
 
 
 def torque_Nm() -> Array:
-    """Five sines, which turn the motor round several times a second."""
+    """Five sines, which reverse the motor several times a second."""
     t = np.arange(N) / RATE_HZ
     waves = ((0.17, 1.5), (0.41, 1.2), (0.9, 1.0), (1.7, 0.8), (3.1, 0.6))
     return np.sum([a * np.sin(2 * np.pi * f * t + f) for f, a in waves], axis=0)

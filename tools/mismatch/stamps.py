@@ -11,7 +11,7 @@ from tools.mismatch.recording_clock import LONGEST_GAP, MOST_MISSING
 
 MOST_PLACES = 5
 _PART = 256
-"""Stamps of which the earliest and the latest, against an even grid, stand for all when the grid turns out steeper."""
+"""Number of stamps of a part: its earliest and latest, against an even grid, stand for it if the grid is corrected."""
 UNEVEN = 0.5
 """Steps that differ from the usual one by more than this share are counted as uneven."""
 
@@ -55,7 +55,7 @@ class StampReader:
     _places: list[str] = field(default_factory=list[str])
     _grid_step: float = 0.0
     _off: list[Array] = field(default_factory=list[Array])
-    """Of each part: its middle sample, and its least and largest distance from a grid of ``_grid_step``."""
+    """Middle samples of the parts, and least and largest distances of their stamps from a grid of ``_grid_step``."""
 
     def add(self, stamps: Array) -> None:
         """Take the next block, float64 (n,), in seconds."""

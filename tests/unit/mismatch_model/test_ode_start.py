@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins import equations
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.memo import Start
+from tools.mismatch.twins.ode_run import run_equations
 
 
 def test_a_start_that_nobody_knows_is_set_by_the_first_samples(tmp_path: Path) -> None:
@@ -191,3 +194,33 @@ def test_a_run_outside_a_search_is_not_that_of_a_search(tmp_path: Path) -> None:
     model.simulate(near, moved)
     fresh = View(recording, view.ranges, 40, afresh=True)
     assert np.array_equal(model.simulate(view, moved)["angle"], model.simulate(fresh, moved)["angle"])
+
+
+@pytest.mark.parametrize(("step", "takes_two_runs"), [(4e-3, True), (-0.8, False)])
+def test_a_search_goes_on_from_the_starts_of_an_earlier_place_while_these_suit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: float, takes_two_runs: bool
+) -> None:
+    recording, _ = pendulum(tmp_path)
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = -150.0, 40.0
+    view = View(recording, ((40, 262), (501, 700), (760, 900)), 40, afresh=True)
+    first = view.near()
+    model.simulate(first, theta)
+    assert first.nearby is not None
+    theta[model.slices(0)[1]] *= 1.0 + step
+    alone = model.residual(view.near(), theta)["angle"]
+    runs: list[None] = []
+
+    def counted(*args: Any) -> np.ndarray:
+        runs.append(None)
+        return run_equations(*args)
+
+    monkeypatch.setattr(equations, "run_equations", counted)
+    found = model.residual(view.near(first.nearby.elsewhere()), theta)["angle"]
+    assert (len(runs) == 2) is takes_two_runs
+    if takes_two_runs:
+        assert np.mean(found**2) < 1.01 * np.mean(alone**2)
+    else:
+        assert np.array_equal(found, alone)

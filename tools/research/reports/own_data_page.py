@@ -147,7 +147,7 @@ def derivatives(t, states, inputs, parameters):
 ```
 
 The function is called once, with symbols, and becomes equations. `math.sin`, Python's `max` and an `if` need numbers
-and fail. The file runs after `micron trust .`; `simulate --trust` and `diagnose --trust` decide it as well. A program
+and fail. The file runs after `micron trust .`; `simulate --trust` and `diagnose --trust` trust it, too. A program
 that simulates by itself is [a twin of your own](adding/twin.md).
 
 {si}
