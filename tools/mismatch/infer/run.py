@@ -62,12 +62,12 @@ def infer(
 ) -> Inferred:  # fmt: skip
     """Prepare the recording and search, without a decision. The linear algebra uses one thread."""
     kept, unsealed = seal(recording)
-    with threadpool_limits(1):
+    # trials may diverge
+    with threadpool_limits(1), np.errstate(all="ignore"):
         posed = pose(kept, held_out, seed, effects, partial(look, constants, jobs, progress))
         found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
         if kept.parts:
-            with np.errstate(all="ignore"):
-                found, posed = pool(found, posed, jobs)
+            found, posed = pool(found, posed, jobs)
     return Inferred(posed, found, recording, unsealed)
 
 
