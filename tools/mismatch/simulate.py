@@ -500,7 +500,7 @@ class Model:
         def carry(x: Array) -> Array:
             for k in behind:
                 # no token tells these signals apart
-                x = self._pass(replace(run, memo={}), k, Signal(x), None, output, how).value
+                x = self._pass(run.head(x.size), k, Signal(x), None, output, how).value
             return x
 
         token: list[object] = []

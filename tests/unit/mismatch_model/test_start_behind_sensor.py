@@ -19,7 +19,10 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.base import Run
 from tools.mismatch.twins.make import make
 
 RATE_HZ, NOISE = 100.0, 0.02
@@ -193,3 +196,34 @@ def test_a_curved_sensor_does_not_bend_the_start_of_a_run(kind: str) -> None:
     _, solved = Projected(posed.problem, model, ("position",), 4000).evaluate(model.start(posed.recording))
     if kind != "ode":  # which searches them
         np.testing.assert_allclose(solved[-3:], truth, rtol=0.02)
+
+
+BEHIND = sorted(e.name for e in EFFECTS.values() if e.driven and e.kind in ("linear", "add") and "output" in e.sites)
+
+
+@pytest.mark.parametrize("name", BEHIND)
+def test_what_is_measured_at_the_start_depends_on_the_start_alone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The start state is the same where the effect behind the output is computed over the whole record."""
+    rec = swing("ode")
+    twin = make(rec)
+    drag = Placed(EFFECTS["quadratic_drag"], "feedback", "v", "mechanics", ("position",))
+    reached: list[int] = []
+
+    def reach(run: Run, at: np.ndarray) -> int:
+        reached.append(of_run(run, at))
+        return reached[-1]
+
+    of_run = Run.reach
+    view = View(rec, ((0, rec.n),), 40)
+    behind = [p for p in sites(twin, rec, EFFECTS[name]) if p.site == "output"]
+    for place in behind:
+        model = Model(twin, [drag, prepare(Model(twin), view, twin.start(rec), place)])
+        theta = model.start(rec)
+        own = slice(model.slices(1)[0].start, None)
+        theta[own] = [0.1 * p.scale for p in model.parameters[own]]
+        found: list[np.ndarray] = []
+        for one in (reach, lambda run, at: run.t.size):
+            monkeypatch.setattr(Run, "reach", one)
+            found.append(model.in_front(View(rec, ((0, rec.n),), 40), theta)["position"])
+        np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-5 * float(np.ptp(found[1])))
+    assert not behind or 0 < max(reached) < rec.n

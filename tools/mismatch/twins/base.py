@@ -58,7 +58,10 @@ class Force:
 
 @dataclass(frozen=True)
 class Path:
-    """Carries an output (n,) through the effects behind it, to what was measured; ``token`` identifies it."""
+    """Carries an output through the effects behind it, to what was measured; ``token`` identifies it.
+
+    ``carry`` takes any number of first samples of a run.
+    """
 
     carry: Callable[[Array], Array]
     token: tuple[object, ...]
@@ -107,9 +110,25 @@ class Run:
         path = self.paths.get(output)
         if path is None:
             return y
-        full = self.about[output].copy() if output in self.about else np.zeros(self.t.size)
+        size = self.reach(at)
+        full = self.about[output][:size].copy() if output in self.about else np.zeros(size)
         full[at] = y
         return path.carry(full)[at]
+
+    def reach(self, at: NDArray[np.int64]) -> int:
+        """Return the number of first samples on which what is measured at the sorted samples ``at`` depends.
+
+        It depends on what was before, and on little after (a clock that runs slow, a central difference).
+        """
+        return min(self.t.size, 2 * (int(at[-1]) + 1))
+
+    def head(self, size: int) -> Run:
+        """Return the first ``size`` samples of the run, without its cache."""
+        if size == self.t.size:
+            return replace(self, memo={})
+        signals, measured = ({o: x[:size] for o, x in of.items()} for of in (self.signals, self.measured))
+        afresh, starts = (tuple(k for k in of if k < size) for of in (self.afresh, self.starts))
+        return replace(self, t=self.t[:size], signals=signals, measured=measured, starts=starts, afresh=afresh, memo={})
 
     @property
     def scale(self) -> Mapping[str, Array]:

@@ -74,11 +74,10 @@ class StartSearch:
 
     def missed(self, x: Array) -> Array:
         """Return what a run (n, s) leaves of the samples that set its start, weighted, (rows, q)."""
-        every = np.arange(self.run.t.size)
         # what is measured behind effects depends on all that was before
-        at = every if self.run.paths else self.seen
+        at = np.arange(self.run.reach(self.seen)) if self.run.paths else self.seen
         readings = self.read(x[at], self.signals[at], self.run.t[at])
-        behind = self.behind_paths(readings, every)[self.seen] if self.run.paths else readings
+        behind = self.behind_paths(readings, at)[self.seen] if self.run.paths else readings
         return (self.measured[self.seen] - behind) * self.weight
 
     def from_states(self, x0: Array) -> Array:
