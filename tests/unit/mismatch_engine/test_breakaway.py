@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording
@@ -93,6 +94,7 @@ def test_a_re_fit_that_leaves_noise_is_the_ground() -> None:
     assert ground_of(problem, far) is far
 
 
+@pytest.mark.slow
 def test_breakaway_is_found_though_the_base_is_bent() -> None:
     """The misfit is rugged: bodies stick and slip at other samples for every value that is tried."""
     problem, base = posed("stribeck")

@@ -55,7 +55,8 @@ def magnetised(u: Array, per_A2: float) -> Array:
     return course
 
 
-@pytest.mark.parametrize("per_A2", [0.02, pytest.param(0.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("per_A2", [0.02, 0.0])
 def test_an_inductance_that_follows_its_current_is_named_and_nothing_else(tmp_path: Path, per_A2: float) -> None:
     rng = np.random.default_rng(3)
     u = np.repeat(rng.uniform(-10.0, 10.0, 100), 25)

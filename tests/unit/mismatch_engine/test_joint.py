@@ -82,6 +82,7 @@ def test_play_in_a_joint_is_named_with_its_size_and_place(tmp_path: Path, gap: f
     assert found.parameters["gap"].value == pytest.approx(2 * gap, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_spring_between_two_bodies_hardens(tmp_path: Path) -> None:
     """The place is the joint: a spring from either body to ground is another force."""
     rng = np.random.default_rng(3)

@@ -64,6 +64,7 @@ def tanks(seed: int) -> Recording:
     return recording("ode", DT, {"pump": pump}, {"level": level}, {"pump": "V", "level": "V"}, twin)
 
 
+@pytest.mark.slow
 def test_a_pair_of_which_each_member_gains_little_alone_is_found() -> None:
     rec = tanks(3)
     names = ("overflow", "square_root_outflow", "dead_time", "first_order_lag", "backlash")
@@ -100,6 +101,7 @@ def cylinder(seed: int) -> Recording:
     return recording("ode", dt, {"valve": valve}, {"stroke": stroke}, {"valve": "V", "stroke": "mm"}, twin)
 
 
+@pytest.mark.slow
 def test_a_pair_is_found_behind_one_effect_that_imitates_both() -> None:
     """Friction with two levels leaves a thirtieth, and every set that grows from it keeps it."""
     problem, _, base = prepared(cylinder(5), 0.3, 0, was_joined=False)

@@ -160,6 +160,7 @@ def test_a_curve_at_the_output_splits_nothing() -> None:
     assert opened(rec, 0.3, 0) is rec
 
 
+@pytest.mark.slow
 def test_a_limit_in_front_of_a_fast_filter_is_no_split_and_no_dead_zone() -> None:
     """Rates of tens of thousands in rad/s, as in any circuit: a companion matrix in seconds overflows."""
     rate_hz, n, rng = 51200.0, 10_000, np.random.default_rng(11)

@@ -116,6 +116,7 @@ hold = "zero"
 """
 
 
+@pytest.mark.slow
 def test_forgotten_damping_of_a_mode_that_rings_is_named_alone(tmp_path: Path) -> None:
     """Over 15 s the phase of the mode turns by 130 rad: a sensitivity over three per cent of its stiffness is none."""
     n, dt, parts = 1500, 0.01, 20

@@ -43,6 +43,7 @@ def test_an_endoscope_has_no_budget_of_tremor() -> None:
     assert "belongs to the instrument" in result.output
 
 
+@pytest.mark.slow
 def test_a_source_costs_what_the_error_gains_by_it_in_each_band(monkeypatch: pytest.MonkeyPatch) -> None:
     """Power adds up: cost^2 is the error's power with everything on less that without the source."""
     quiet = "accelerometer noise"
