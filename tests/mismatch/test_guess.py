@@ -24,9 +24,10 @@ from tools.mismatch.recording_load import load
         ("gyro_deg/s", ("gyro", "deg/s")), ("accel_1", ("accel_1", "")), ("plain", ("plain", "")),
         ("sensor_left", ("sensor_left", "")), ("T/degC", ("T", "degC")),
         ("speed_rad_s", ("speed", "rad/s")), ("a_m_s2", ("a", "m/s2")), ("sun_W_m2", ("sun", "W/m2")),
-        ("wheel_l", ("wheel_l", "")), ("tank_ml", ("tank", "ml")), ("speed_in_s", ("speed_in", "s")),
+        ("wheel_l", ("wheel_l", "")), ("tank_ml", ("tank", "ml")), ("speed_in_s", ("speed", "in/s")),
         ("dilution_1_h", ("dilution", "1/h")), ("feed_g_l", ("feed", "g/l")), ("flow_l_min", ("flow", "l/min")),
         ("charge_A_h", ("charge", "Ah")), ("x_V_min", ("x_V_min", "")), ("pump_1_s", ("pump_1", "s")),
+        ("clock_in_s", ("clock_in", "s")), ("heater_pct", ("heater", "%")), ("force_klbf", ("force", "klbf")),
         ("force_N_l", ("force_N_l", "")), ("pump_1_l", ("pump_1_l", "")), ("flow_m3_h", ("flow", "m3/h")),
     ],
 )  # fmt: skip

@@ -394,6 +394,10 @@ def simulate(
         Path | None, typer.Argument(metavar="[RECORDING]", help="A recording (folder or .toml) for the corrected twin.")
     ] = None,
     *,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="FILE", help="Another data file with the columns of the recording, say a test."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
     image: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE", help="Picture of recorded, simulated and residual.")
@@ -407,9 +411,10 @@ def simulate(
     Example: micron mismatch simulate twin.py rec --out simulated.csv
 
     The recording's own twin, and what was read of the recording: micron mismatch simulate rec --picture rec.png
+    On another run of the machine, in columns of the same names: micron mismatch simulate rec --data test.csv
     """
     with clear_errors():
-        check_writable(out, image, json_file, reads=[twin, recording])
+        check_writable(out, image, json_file, reads=[twin, recording, data])
         check_picture(image)
         decide_on([twin, recording or twin], trust, allow_outside)
         from tools.mismatch.export.picture import save_run
@@ -418,7 +423,7 @@ def simulate(
         from tools.mismatch.recording_load import columns_left_out, load
         from tools.mismatch.simulate_bounds import run_bounded
 
-        loaded = load(recording or twin)
+        loaded = load(recording or twin, data)
         for line in as_read(loaded):
             _print_read(line)
         left_out = columns_left_out(recording or twin)
@@ -429,7 +434,7 @@ def simulate(
             )
 
         def run() -> dict[str, Array]:
-            return simulate_own(loaded) if recording is None else simulate_file(twin, recording)
+            return simulate_own(loaded) if recording is None else simulate_file(twin, loaded)
 
         simulated = run_bounded(twin, loaded, run)
         rows: list[Residual] = residuals(loaded, simulated)

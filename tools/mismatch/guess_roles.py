@@ -24,7 +24,7 @@ _AMOUNT = r"km|m3|m?[lL]|[mk]?g|m?mol"
 _OVER = {"h": rf"1|{_AMOUNT}|[mk]?[AW]", "min": _AMOUNT, "l": r"[mku]?g|[mu]?mol", "L": r"[mku]?g|[mu]?mol"}
 """What may stand over a last part that is also a word or a side: ``x_V_min`` is a smallest voltage, ``force_N_l`` the
 left one."""
-_SPOKEN = {"mps": "m/s", "mps2": "m/s^2", "radps": "rad/s", "radps2": "rad/s^2"}
+_SPOKEN = {"mps": "m/s", "mps2": "m/s^2", "radps": "rad/s", "radps2": "rad/s^2", "pct": "%", "percent": "%"}
 """Units as names of columns spell them."""
 _ORDINARY_WORDS = ("in", "ft", "min", "h", "l", "L", "F", "H")
 """Units that are also words or letters (``x_in``, ``x_min``, ``wheel_l``). They count as units in brackets only."""
@@ -64,7 +64,7 @@ class Assignment:
 def split_unit(name: str) -> tuple[str, str]:
     """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
     quotient = _QUOTIENT.match(name.strip())
-    if quotient is not None and quotient["over"] != "in":
+    if quotient is not None and (quotient["over"] != "in" or re.search(r"vel|speed", quotient["name"], re.IGNORECASE)):
         over, under = quotient["over"], quotient["under"]
         # ampere hours and watt hours are products
         unit = f"{over}h" if under == "h" and over[-1] in "AW" else f"{over}/{under}"

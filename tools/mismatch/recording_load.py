@@ -32,24 +32,26 @@ STANDS_STILL: Mapping[str, Any] = {"states": {"no_state": "1"}, "equations": {"n
 """Keys of ``[twin]`` for every kind; those of an ode's parameters may stand there, too."""
 
 
-def load(path: Path | str) -> Recording:
+def load(path: Path | str, data: Path | None = None) -> Recording:
     """Load the recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), check and convert it.
 
-    Raises RecordingError for any fault.
+    ``data``: another file with the same columns in place of the descriptor's own, as one run without a split. Raises
+    RecordingError for any fault.
     """
     path = Path(path)
     if path.is_dir():
         path = path / "recording.toml"
-    return from_table(path, _toml(path))
+    return from_table(path, _toml(path), data=data)
 
 
 def from_table(
-    path: Path, text: Mapping[str, Any], columns: Mapping[str, Array] | None = None, twin: TwinText | None = None
-) -> Recording:
+    path: Path, text: Mapping[str, Any], columns: Mapping[str, Array] | None = None, twin: TwinText | None = None,
+    *, data: Path | None = None,
+) -> Recording:  # fmt: skip
     """Build the recording that a descriptor's table describes, checked and converted. Messages name ``path``.
 
-    If given, ``columns`` (n,) by name replace the data file, and ``twin`` the table ``[twin]``. Raises RecordingError
-    for any fault.
+    If given, ``columns`` (n,) by name replace the data file, ``data`` is another one (``load``), and ``twin`` replaces
+    the table ``[twin]``. Raises RecordingError for any fault.
     """
     where = str(path)
     if text.get("format") != 1:
@@ -66,7 +68,9 @@ def from_table(
         words = Vocabulary(open_ended=True)
     refuse_unknown_keys(f"{where}:", text, TOP_KEYS)
     notes: list[str] = []
-    data_path = path if columns is not None else path_inside(path, str(data_name))
+    if data is not None:
+        text = {key: value for key, value in text.items() if key not in ("split", "segments")}
+    data_path = path if columns is not None else data or path_inside(path, str(data_name))
     in_file = column_units(data_path) if columns is None and data_path.is_file() else {}
     channels = read_channels(where, text["channels"], words, twin.kind, notes, in_file)
     if twin.kind == "ode":

@@ -17,7 +17,7 @@ from tests.unit.mismatch_report.contract_check import NAMES, faults
 from tests.unit.mismatch_report.systems import TWIN, recording
 from tools.cli.main import app
 from tools.mismatch.export.run import free_run
-from tools.mismatch.recording_load import load
+from tools.mismatch.recording_load import descriptor, load
 from tools.research.prove.proof import ProofResult
 
 runner = CliRunner()
@@ -321,6 +321,19 @@ def test_simulate_draws_recorded_simulated_and_residual(stack: Path, tmp_path: P
     refused = run("simulate", stack, "--picture", tmp_path / "run.txt")
     assert refused.exit_code == 2
     assert "a picture ends in" in refused.stderr
+
+
+def test_simulate_runs_on_other_data_with_the_columns_of_the_recording(stack: Path, tmp_path: Path):
+    other = recording(tmp_path / "other", change=straight, samples=200)
+    data = other.parent / descriptor(other)["data"]
+    expected = json.loads(run("simulate", other.parent, "--json", "-").stdout)
+    result = run("simulate", stack, "--data", data, "--json", "-")
+    assert result.exit_code == 0
+    assert "samples: 200 at" in result.stderr
+    assert json.loads(result.stdout)["outputs"] == expected["outputs"]
+    refused = run("simulate", stack, "--data", tmp_path / "nothing.csv")
+    assert refused.exit_code == 2
+    assert "nothing.csv" in refused.stderr
 
 
 def test_simulate_of_no_recording_is_bad_input(tmp_path: Path):

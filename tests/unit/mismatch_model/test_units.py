@@ -15,6 +15,7 @@ from tools.mismatch.units import UnitError, convert, convert_difference, parse, 
     [
         (1.5, "mV", "V", 1.5e-3),
         (2.0, "um", "m", 2e-6),
+        (1.0, "kip", "klbf", 1.0),
         (2.0, "µm", "um", 2.0),
         (180.0, "deg/s", "rad/s", math.pi),
         (60.0, "rpm", "rad/s", 2 * math.pi),

@@ -110,14 +110,14 @@ def simulate_own(recording: Recording) -> dict[str, Array]:
     return {o: units.convert(y, recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
 
 
-def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
+def simulate_file(twin: Path | str, recording: Path | str | Recording) -> dict[str, Array]:
     """Return the outputs (n,) of a twin over a whole recording, by signal, in the units of the recording's file.
 
     ``twin`` is a file of ``micron mismatch apply`` (.toml, .py or .fmu). It runs freely: measured outputs set only the
     state at the first samples of a .toml twin with states; a .py twin has its written start state. Raises
     RecordingError for a fault of either file.
     """
-    path, rec = Path(twin), load(recording)
+    path, rec = Path(twin), recording if isinstance(recording, Recording) else load(recording)
     if not path.is_file():
         raise RecordingError(f"{path}: no such twin; give a file that 'micron mismatch apply' wrote")
     match path.suffix.lower():
