@@ -54,7 +54,7 @@ def tangent(model: Model, k: int, view: View, theta: Array, inside: OdeTwin) -> 
         return []
     base = theta[: model.n_base]
     run = view_run(model.twin, view)
-    others = [model.force(j, theta) for j, p in enumerate(model.placed) if p.site == "feedback" and j != k]
+    others = [model.chain.force(j, theta) for j, p in enumerate(model.placed) if p.site == "feedback" and j != k]
     states, signals = inside.states(run, {}, base, others)
     at = np.linspace(0, states.shape[0] - 1, FIELD_SAMPLES).astype(np.int64)
     x, u = np.ascontiguousarray(states[at]), np.ascontiguousarray(signals[at])

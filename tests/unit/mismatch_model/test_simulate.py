@@ -105,7 +105,7 @@ def test_design_is_the_simulation(make_one: object, names: tuple[str, ...]) -> N
     ends = {f: model.simulate(view, theta + f * step) for f in (0, 1, 2, 4)}
     for o in run:
         scale = float(np.max(np.abs(ends[0][o]))) + 1e-12
-        if model.curved:
+        if model.chain.curved:
             short, long = (ends[2 * k][o] - 2 * ends[k][o] + ends[0][o] for k in (1, 2))
             assert 0.1 < np.linalg.norm(short) / np.linalg.norm(long) < 0.4
             assert np.max(np.abs(short)) < 1e-2 * np.max(np.abs(ends[1][o] - ends[0][o]))

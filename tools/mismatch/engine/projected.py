@@ -260,7 +260,7 @@ class Projected:
             parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
             return np.concatenate([*parts, self._from_priors(theta)]), theta
         solved = self._solved(theta)
-        for _ in range(AGAIN if self.model.curved else 0):
+        for _ in range(AGAIN if self.model.chain.curved else 0):
             if solved is None:
                 break
             theta, before = solved
