@@ -70,5 +70,8 @@ BACKLASH = Effect(
     basis=_basis,
     report=_report,
     vanishes_with=(("gap",), ("slope_lost_inside",)),
+    # an output that is stiffer inside, or turns back, has no play: it is that of a hysteresis
+    limits={"slope_lost_inside": (0.0, 1.0)},
+    estimated=("slope_lost_inside",),
     essential=("half_gap",),
 )

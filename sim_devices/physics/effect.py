@@ -292,6 +292,12 @@ class Effect:
     """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect is absent when every
     parameter of any one group is zero, so it is named only where the data exclude that. Empty: one group of all.
     """
+    plain_in: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    """Ranges of human parameters in which the effect is no more than a plainer one (a slew limit that is never met is a
+    lag). It is not named while the 95 % interval of one reaches into its range."""
+    laws: int = 1
+    """Number of simpler laws that the effect joins. It has the price of as many names, or a flexible one would stand
+    for every pair of plain ones."""
     estimated: tuple[str, ...] = ()
     """Those of ``limits`` that scatter with the noise: such a parameter is outside only where its 95 % interval is."""
     weights_beside: Callable[[Settings], int] | None = None

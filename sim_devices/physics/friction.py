@@ -205,6 +205,7 @@ def _loop_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (
         Human("presliding_stiffness", float(p[2] / p[0]) / g, "{in}/{out}"),
         Human("yield_distance", float(p[0]), "{out}"),
+        Human("yield_share_of_travel", float(p[0]) / settings.get("travel", (1.0,))[0], "1"),
         Human("lean", float(p[1]), "1"),
     )
 
@@ -223,6 +224,8 @@ BOUC_WEN = replace(
     ),
     report=_loop_report,
     vanishes_with=(("presliding_stiffness",),),
+    # what does not yield within the recorded motion is a spring
+    plain_in={"yield_share_of_travel": (1.0, np.inf)},
 )
 
 _LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"

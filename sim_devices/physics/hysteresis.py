@@ -505,5 +505,7 @@ HYSTERESIS = Effect(
     variants=(_FORCE,),
     weights_beside=lambda settings: CURVES if _form(settings) == "stops_curved" else 0,
     vanishes_with=(("loop_width_share",),),
+    # elements whose loop may be closed are a curve
+    plain_in={"loop_width_share": (-np.inf, 0.0)},
     plain="backlash",
 )

@@ -98,6 +98,7 @@ _UNEVEN_SLEW = Effect(
     confusable_with=("first_order_lag", "saturation"),
     # a limit that is not met leaves the lag alone
     limits={"share_of_fastest_input": (0.0, 1.0)},
+    plain_in={"share_of_fastest_input": (1.0, np.inf)},
     prepare=_slew_prepare,
     guess=_slew_guess,
     apply=_slew_apply,

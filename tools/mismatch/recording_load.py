@@ -19,7 +19,7 @@ from tools.mismatch.recording_channels import Channel, converted, finite_number,
 from tools.mismatch.recording_clock import CUT, in_seconds, on_grid, time_step
 from tools.mismatch.recording_columns import SUFFIXES, column_names, column_units, read_columns
 from tools.mismatch.recording_ranges import read_conditions, read_segments, read_split
-from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
+from tools.mismatch.twins.vocabulary import KINDS, NO_STATE, Role, Vocabulary, user_kinds, vocabulary
 from tools.numbers import is_finite_number
 
 MIN_SAMPLES = 50
@@ -27,7 +27,7 @@ TOP_KEYS = (
     "format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions",
 )  # fmt: skip
 TWIN_KEYS = ("kind", "parameters", "effects", "file")
-STANDS_STILL: Mapping[str, Any] = {"states": {"no_state": "1"}, "equations": {"no_state": "-no_state"}}
+STANDS_STILL: Mapping[str, Any] = {"states": {NO_STATE: "1"}, "equations": {NO_STATE: f"-{NO_STATE}"}}
 """Equations of a curve, whose outputs follow the inputs at once: its one state stays at zero."""
 """Keys of ``[twin]`` for every kind; those of an ode's parameters may stand there, too."""
 

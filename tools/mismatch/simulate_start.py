@@ -14,8 +14,8 @@ from sim_devices.physics.heat_loss import KELVIN, TEMPERATURES
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_chain import make_context
 from tools.mismatch.simulate_balance import balanced, shifted
+from tools.mismatch.simulate_chain import make_context
 from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, travelled

@@ -12,7 +12,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
 from sim_devices.physics.hysteresis import CURVES, FORMS
 from tests.unit.mismatch_engine.cases import RATE, among, named, recording, wave
-from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero
+from tools.mismatch.engine.evidence import Doubt, absent_groups, doubt_of, holds_zero
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.report import ParameterValue, Report, Withheld
@@ -184,6 +184,33 @@ def test_a_record_of_one_speed_does_not_say_that_a_loop_changes_with_speed() -> 
     for p in report.physics:
         if p.name == "rate_dependent_hysteresis":
             assert not holds_zero(p.parameters["change_with_speed"])
+
+
+LAG_ALONE = {**RATE_FREE, "loop_width_share_slow": ParameterValue(0.1, "1", (-0.03, 0.23))}
+LAG_ALONE["change_with_speed"] = ParameterValue(0.6, "1", (0.4, 0.8))
+NEVER_MET = {
+    "rate_up": ParameterValue(931.0, "V/s", (374.0, 1487.0)),
+    "share_of_fastest_input": ParameterValue(0.9, "1", (0.4, 1.6)),
+}
+
+
+def test_a_loop_that_may_close_at_rest_is_that_of_a_lag() -> None:
+    _, _, store = weighed(slow_loop(), "rate_dependent_hysteresis")
+    fitted = next(s.fitted for s in store.sets.values() if s.placed)
+    doubt = doubt_of(fitted, 0, LAG_ALONE, uncertainty(store.problem, fitted))
+    assert doubt is not None
+    assert doubt.shown_by == ("loop_width_share_slow",)
+    laws = {s.placed[0].effect.name: s.laws for s in store.sets.values() if s.placed}
+    assert laws["rate_dependent_hysteresis"] == 2
+
+
+def test_a_limit_that_may_never_be_met_is_no_more_than_a_lag() -> None:
+    _, _, store = weighed(slow_loop(), "slew_limit")
+    fitted = next(s.fitted for s in store.sets.values() if s.placed)
+    unsure = uncertainty(store.problem, fitted)
+    assert doubt_of(fitted, 0, NEVER_MET, unsure) == Doubt(0, "holds_plain", ("share_of_fastest_input",))
+    met = {**NEVER_MET, "share_of_fastest_input": ParameterValue(0.5, "1", (0.4, 0.6))}
+    assert doubt_of(fitted, 0, met, unsure) is None
 
 
 def test_a_curve_that_trades_with_a_gain_is_sure_as_a_whole() -> None:

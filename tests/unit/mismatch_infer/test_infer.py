@@ -55,21 +55,19 @@ class _Store:
 class _Set:
     """The part of a scored set that its score reads."""
 
-    def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0, choices: float = 0.0) -> None:
+    def __init__(self, density: float, laws: int, parameters: int, idle: int = 0, choices: float = 0.0) -> None:
         self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
-        self.names, self.parameters, self.choices, self.proper = frozenset(names), parameters, choices, True
+        self.laws, self.parameters, self.choices, self.proper = laws, parameters, choices, True
 
 
 def test_a_name_and_a_parameter_have_their_price() -> None:
     c = replace(START, per_name=5.0, per_parameter=0.5)
     store = _Store(Count(200.0, 50.0), c)
-    assert store.score(_Set(0.1, {"a"}, 3)) == pytest.approx(200 * 0.1 - 5 - 1.5)
-    assert store.score(_Set(0.1, {"a"}, 3, choices=2.0)) == pytest.approx(200 * 0.1 - 5 - 2 - 1.5)
-    assert store.score(_Set(0.1, {"a", "b"}, 3)) == pytest.approx(200 * 0.1 - 10 - 1.5)
-    assert store.score(_Set(-0.2, set(), 0)) == pytest.approx(-store.count.lost(0.2))
-    assert _Store(Count(200.0, 50.0), c, 4).score(_Set(-0.2, set(), 0, idle=3)) == pytest.approx(
-        -store.count.lost(0.2) / 4
-    )
+    assert store.score(_Set(0.1, 1, 3)) == pytest.approx(200 * 0.1 - 5 - 1.5)
+    assert store.score(_Set(0.1, 1, 3, choices=2.0)) == pytest.approx(200 * 0.1 - 5 - 2 - 1.5)
+    assert store.score(_Set(0.1, 2, 3)) == pytest.approx(200 * 0.1 - 10 - 1.5)
+    assert store.score(_Set(-0.2, 0, 0)) == pytest.approx(-store.count.lost(0.2))
+    assert _Store(Count(200.0, 50.0), c, 4).score(_Set(-0.2, 0, 0, idle=3)) == pytest.approx(-store.count.lost(0.2) / 4)
 
 
 @pytest.mark.parametrize("count", [Count(218.0, 50.0), Count(300.0, 300.0), Count(900.0, 4.0)])

@@ -42,6 +42,12 @@ def holds_zero(p: ParameterValue, among: int = 1) -> bool:
     return p.value - wider * (p.value - lo) <= 0.0 <= p.value + wider * (hi - p.value)
 
 
+def reaches(p: ParameterValue, span: tuple[float, float]) -> bool:
+    """Return True if the 95 % interval of a parameter reaches into ``span`` or is not finite."""
+    lo, hi = p.ci95
+    return not (np.isfinite(lo) and np.isfinite(hi)) or (lo <= span[1] and hi >= span[0])
+
+
 def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> list[tuple[str, ...]]:
     """Return the groups of ``effect.vanishes_with`` of which all parameters may be zero, as the parameters' names."""
     out: list[tuple[str, ...]] = []
@@ -62,6 +68,9 @@ def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsu
     stuck = tuple(n for n in placed.effect.essential if f"{placed.label}.{n}" in at_bound)
     if stuck:
         return Doubt(k, "at_limit", stuck)
+    plain = tuple(n for n, span in placed.effect.plain_in.items() if n in parameters and reaches(parameters[n], span))
+    if plain:
+        return Doubt(k, "holds_plain", plain)
     own, weights = fitted.model.slices(k)
     showing = weights.stop - weights.start - placed.weights_beside
     whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1 and showing > 1

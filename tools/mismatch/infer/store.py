@@ -77,6 +77,11 @@ class Scored:
     def placed(self) -> tuple[Placed, ...]:
         return self.fitted.model.placed
 
+    @property
+    def laws(self) -> int:
+        """Return the number of laws that the names stand for."""
+        return sum(max(p.effect.laws for p in self.placed if p.effect.name == name) for name in self.names)
+
 
 class Store:
     """Holds every set that a search has fitted.
@@ -172,7 +177,7 @@ class Store:
         the outputs that have something to explain, because an error of form on one of them is repeated on all.
         """
         c = self.constants
-        prices = c.per_name * len(s.names) + s.choices + c.per_parameter * s.parameters
+        prices = c.per_name * s.laws + s.choices + c.per_parameter * s.parameters
         return -self.lost(s) - prices if s.proper else -np.inf
 
     def lost(self, s: Scored) -> float:

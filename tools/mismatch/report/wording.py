@@ -353,7 +353,8 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
             p = w.parameters[n]
             value, lo, hi = interval(p)
             sizes.append(f"{label(n, p.unit)} {value} ({lo} .. {hi}) {'' if p.unit == '1' else p.unit}".rstrip())
-        why = f"its size may be zero: {', '.join(sizes)}"
+        what = "its size may be zero" if w.reason == "holds_zero" else "it may be no more than a plainer effect"
+        why = f"{what}: {', '.join(sizes)}"
     factor, scaled_unit = shown_in(fit, w.output, max(w.residual_rms_without, w.residual_rms_with))
     without, within = number(w.residual_rms_without * factor), number(w.residual_rms_with * factor)
     instead = f"; {words(w.replaced_by)} is named instead" if w.replaced_by else ""

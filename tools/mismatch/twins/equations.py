@@ -168,11 +168,12 @@ class State:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Holds ``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
+    """Holds ``x' = a x + b u``, ``y = c x + d u`` about the mean of a run, in the order of states, signals, outputs."""
 
     a: Array
     b: Array
     c: Array
+    d: Array
 
 
 def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: Array) -> Linearised:
@@ -190,7 +191,7 @@ def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: 
     # rounding errors after cancellation
     slope[np.abs(slope) < 1e-9 * np.max(np.abs(f), axis=0)[:, None] / move] = 0.0
     reading = (y[:half] - y[half:]).T / (2 * move)
-    return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]))
+    return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]), reading[:, s:])
 
 
 def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:

@@ -33,6 +33,7 @@ from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import Start, remember, stored
 from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive
 from tools.mismatch.twins.ode_start import StartSearch
+from tools.mismatch.twins.vocabulary import NO_STATE
 
 MOST_SUBSTEPS = 200
 FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
@@ -252,7 +253,9 @@ class OdeTwin(Head):
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
-        """See Twin. Nothing stays linear behind the equations."""
+        """See Twin. Nothing stays linear behind equations, but for outputs that are sums of their inputs at once."""
+        if not join and not forces and self.sums_inputs:
+            return self._sums(run, inputs, theta)
         used = {s: fold(x, theta) for s, x in inputs.items()}
         key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window, run.nearby)
         key = (*key, *(x.token for x in used.values()), *((o, p.token) for o, p in run.paths.items()))
@@ -266,6 +269,28 @@ class OdeTwin(Head):
         with np.errstate(all="ignore"):
             stacked = remember(run.memo, key, make)
         return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
+
+    @cached_property
+    def sums_inputs(self) -> bool:
+        """Return True if no state moves and the outputs are affine in the signals."""
+        return self.reads_affine and all(x.name == NO_STATE for x in self.state_list)
+
+    def _sums(self, run: Run, inputs: Mapping[str, Signal], theta: Array) -> dict[str, Signal]:
+        """Return outputs that are sums of the inputs and of their columns."""
+        plain = {s: Signal(x.value, {}, x.token) for s, x in inputs.items()}
+        values, m = self.values(theta), len(self.signals)
+        none = np.zeros((m + 1, len(self.state_list)))
+        units = np.ascontiguousarray(np.vstack([np.zeros(m), np.eye(m)]))
+        y = self.equations.readings(none, units, np.zeros(m + 1), values)
+        found: dict[str, Signal] = {}
+        for i, (o, signal) in enumerate(self.respond(run, plain, theta, (), True).items()):
+            columns: dict[int, Array] = {}
+            for k, s in enumerate(self.signals):
+                gain = float(y[k + 1, i] - y[0, i])
+                for j, c in inputs[s].columns.items() if s in inputs and gain != 0.0 else ():
+                    columns[j] = columns[j] + gain * c if j in columns else gain * c
+            found[o] = replace(signal, columns=columns)
+        return found
 
     def states(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
@@ -405,6 +430,9 @@ class OdeTwin(Head):
         x0 = remember(run.lasting, ("about", run.starts), plain)
         x0 = np.where(np.isfinite(x0), x0, given)
         reading = remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
+        if not np.all(np.isfinite(reading)):
+            # a trial at which the outputs have no value, a root of a negative number
+            return np.full((run.t.size, len(self.state_list)), np.nan)
         weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
         whole = run.setting if self.integrates else None
         seen = whole
@@ -460,8 +488,9 @@ class OdeTwin(Head):
     def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
         """See Twin; ``signal`` is an input or the name of a place."""
         lin = self.linearised(self.values(theta))
+        at_once = np.zeros(len(self.outputs))
         if signal in self.signals:
-            b = lin.b[:, self.signals.index(signal)]
+            b, at_once = (of[:, self.signals.index(signal)] for of in (lin.b, lin.d))
         else:
             b = np.zeros(len(self.state_list))
             place = self.place(signal)
@@ -474,7 +503,10 @@ class OdeTwin(Head):
         at = np.array(run.starts, np.int64)
 
         def carry(change: Array) -> Array:
-            y = {o: run_output(d.ad, d.g0, d.g1, np.ascontiguousarray(c[o]), change, at) for o in self.outputs}
+            y = {
+                o: run_output(d.ad, d.g0, d.g1, np.ascontiguousarray(c[o]), change, at) + gain * change
+                for o, gain in zip(self.outputs, at_once.tolist(), strict=True)
+            }
             free = ss.response(ss.states({o: -v for o, v in y.items()}), output, change.size)
             return y[output] + free
 

@@ -37,6 +37,8 @@ class Vocabulary:
         return ", ".join(p for p, _ in (self.inputs if role == "input" else self.outputs))
 
 
+NO_STATE = "no_state"
+"""Name of the one state, which stays at zero, of equations that are a curve."""
 CONTEXT_UNITS = MappingProxyType(
     {
         "temperature": ("degC",),

@@ -180,9 +180,9 @@ unit = "mm"
 ```
 
 `micron mismatch simulate .` runs the twin that the recording describes and prints what was read (samples, rate, units,
-holds, notes) and the residual; `--picture FILE` draws it. A wrong unit or sign shows here, before the diagnosis. An
-input without `hold` runs straight here; `diagnose` infers its course. The first command of a version compiles for a
-minute or more.
+holds, notes) and the residual; `--picture FILE` draws it, `--data FILE` takes another run (the same columns). A wrong
+unit or sign shows here, before the diagnosis. An input without `hold` runs straight here; `diagnose` infers its course.
+The first command of a version compiles for a minute or more.
 
 Name the commanded value as input where there is one. A measured input has noise. An effect that smooths this noise (a
 lag, a resonance) then predicts better, although the machine has no such effect. State the input's `noise_rms`, and the
