@@ -17,7 +17,7 @@ from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.report import ParameterValue, Report, Withheld
 from tools.mismatch.engine.screen import places
-from tools.mismatch.infer import diagnose
+from tools.mismatch.infer import decide, diagnose
 from tools.mismatch.infer.borne_out import borne_out as borne_out_of
 from tools.mismatch.infer.constants import learned
 from tools.mismatch.infer.store import Store
@@ -211,6 +211,19 @@ def test_a_limit_that_may_never_be_met_is_no_more_than_a_lag() -> None:
     assert doubt_of(fitted, 0, NEVER_MET, unsure) == Doubt(0, "holds_plain", ("share_of_fastest_input",))
     met = {**NEVER_MET, "share_of_fastest_input": ParameterValue(0.5, "1", (0.4, 0.6))}
     assert doubt_of(fitted, 0, met, unsure) is None
+
+
+@pytest.mark.parametrize(("explained", "whole"), [(50.0, True), (5.0, False)])
+def test_noise_that_would_be_louder_than_what_was_found_is_a_doubt(
+    monkeypatch: pytest.MonkeyPatch, explained: float, whole: bool
+) -> None:
+    """Ten noise variances are left, and none of them if the noise is as loud as it can be."""
+    _, _, store = weighed(slow_loop(), "hysteresis")
+    left = {False: (10.0, explained), True: (0.0, explained)}
+    monkeypatch.setattr(decide, "worst_left", lambda *_, doubt: left[doubt])
+    named = next(s for s in store.sets.values() if s.placed)
+    assert decide.judge(store, named, None).whole is whole
+    assert not decide.judge(store, store.base, None).whole
 
 
 def test_a_curve_that_trades_with_a_gain_is_sure_as_a_whole() -> None:

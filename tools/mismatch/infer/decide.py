@@ -437,8 +437,9 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
                 for o, v in rest.left.items()
             }
             return Judged(final, replace(rest, left=left), False, (), False)
-    # without a named effect the noise as estimated decides, so that the doubt is reported
-    whole = strange is None and (loud if final.placed else quiet)
+    # the noise as estimated decides where nothing is named, and where more would be left of it than the names explain:
+    # a doubt that is larger than what was found is reported
+    whole = strange is None and (quiet or (loud and bool(final.placed) and left[0] <= left[1]))
     doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
     return Judged(final, rest, whole, doubtful, whole and quiet and most_left[0] <= c.cut)
 
