@@ -93,9 +93,10 @@ class Vouched:
 class Withheld:
     """Holds an effect that lowered the residual and is not named.
 
-    ``shown_by``: the parameters (of ``parameters``, or searched ones) whose interval contains zero or that ended at a
-    limit of the search, or the signal that the course of an independent effect follows. ``residual_rms_without`` and
-    ``_with`` are held out; ``replaced_by``: the simpler effect that is named in its place.
+    ``shown_by``: the parameters (of ``parameters``, or searched ones) whose interval contains zero or the range of a
+    plainer effect, or that ended at a limit of the search, or the signal that the course of an independent effect
+    follows. ``residual_rms_without`` and ``_with`` are held out; ``replaced_by``: the simpler effect that is named in
+    its place.
     """
 
     name: str
