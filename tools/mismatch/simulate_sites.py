@@ -151,7 +151,9 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     if outputs:
         # behind a plant with states only what does not commute with it tells its place: it sits at the sensor
         behind = stage if effect.kind == "linear" else _behind(twin, effect, stage)
-        found += [Placed(effect, "output", o, behind, (o,)) for o in usable]
+        # and what an actuator alone can have is in front of it
+        if effect.kind == "linear" or STAGES.index(behind) >= STAGES.index("mechanics"):
+            found += [Placed(effect, "output", o, behind, (o,)) for o in usable]
     if inputs and (effect.driven or not outputs):
         if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present and _commutes(twin):
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]

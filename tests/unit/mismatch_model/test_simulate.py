@@ -197,6 +197,10 @@ def test_sites_and_reasons() -> None:
     assert [p.target for p in delays] == 2 * ["voltage_x", "voltage_y", "voltage_z"]
     kinds = {p.site for p in sites(make(oscillator()), oscillator(), EFFECTS["hysteresis"])}
     assert kinds == {"input", "output", "feedback"}
+    # what an actuator alone has is in front of a plant that moves
+    actuated = sites(make(oscillator()), oscillator(), EFFECTS["rate_dependent_hysteresis"])
+    assert {p.site for p in actuated} == {"input"}
+    assert {p.site for p in sites(twin, rec, EFFECTS["rate_dependent_hysteresis"])} == {"output"}
 
 
 def test_bursts_are_excused() -> None:
