@@ -175,6 +175,7 @@ COGGING_FORCE = Effect(
     summary="force periodic in position",
     kind="feedback",
     by_position=True,
+    not_units=("V", "A", "C", "degC", "K", "Pa"),  # magnets and teeth are at places
     stages=("mechanics", "actuator"),
     parts=_cog_parts,
     equation=r"m\ddot x = F + \sum_h a_h \sin(2\pi h x/\lambda) + b_h \cos(2\pi h x/\lambda)",
