@@ -159,9 +159,11 @@ class Model:
             g = self.twin.sensitivity(pl.outputs[0], theta[: self.n_base])
             if pl.site == "output" and not self.twin.static:
                 g = 1.0  # driven by the output itself
-            inside = inside_of(self.twin) if pl.site == "feedback" else None
-            if inside is not None:
+            inside = inside_of(self.twin)
+            if inside is not None and pl.site == "feedback":
                 g = inside.force_gain(pl.target, theta[: self.n_base])[0]
+            if inside is not None and pl.site == "input":
+                g = inside.input_gain(pl.target, theta[: self.n_base])
             if pl.effect.report is not None:
                 out[pl.label] = list(pl.effect.report(p, pl.settings, g))
             else:
@@ -304,7 +306,8 @@ class Model:
     def driven(self, run: Run, theta: Array) -> Run:
         """Return the run with its inputs as they are behind their effects."""
         inputs, _ = self.chain.driven(run, Pass(theta, True))
-        behind = {s: fold(x, theta).value for s, x in inputs.items() if s in run.signals}
+        gain = self.twin.input_gain
+        behind = {s: fold(x, theta, gain(s, theta)).value for s, x in inputs.items() if s in run.signals}
         return replace(run, signals={**run.signals, **behind}, memo={})
 
     def start_states(self, view: View, theta: Array) -> Array:
@@ -314,7 +317,7 @@ class Model:
         run = view_run(self.twin, view)
         how = Pass(theta, True)
         inputs, forces = self.chain.driven(run, how)
-        used = {s: fold(x, theta) for s, x in inputs.items()}
+        used = {s: fold(x, theta, inside.input_gain(s, theta)) for s, x in inputs.items()}
         _, run = self.chain.started(run, inputs, how, forces)
         return inside.states(run, used, theta, forces)[0][0]
 

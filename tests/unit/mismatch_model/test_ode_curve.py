@@ -113,11 +113,16 @@ def damper(folder: Path) -> Path:
 
 def test_memory_of_an_input_that_an_output_follows_at_once_is_named(tmp_path: Path) -> None:
     """The element is stiffer before it slips, which is no play."""
+    path = damper(tmp_path)
     names = ("hysteresis", "backlash", "static_nonlinearity", "first_order_lag")
-    report = diagnose(load(damper(tmp_path)), jobs=1, effects=[EFFECTS[n] for n in names])
+    report = diagnose(load(path), jobs=1, effects=[EFFECTS[n] for n in names])
     (found,) = report.physics
     assert (found.name, found.site, found.target) == ("hysteresis", "input", "displacement")
     assert report.fit.fitted_rms["force"] < 1.3 * 5.0
+    for name in ("twin.py", "twin.toml"):
+        write_twin(corrected_twin(path, report.to_json()), report.to_json(), tmp_path / name)
+        left = simulate_file(tmp_path / name, path)["force"] - load(path).outputs["force"]
+        assert rms(left) < 1.3 * 5.0
 
 
 def test_what_passes_at_once_is_seen_at_the_output(tmp_path: Path) -> None:

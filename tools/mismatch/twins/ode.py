@@ -118,8 +118,11 @@ class OdeTwin(Head):
         return 1.0
 
     def input_gain(self, signal: str, theta: Array) -> float:
-        """See Twin."""
-        return 1.0
+        """See Twin: where outputs are sums of the inputs, that of the output which follows the signal most."""
+        if not self.sums_inputs or signal not in self.signals:
+            return 1.0
+        gains = self._gains(theta)[:, self.signals.index(signal)]
+        return float(gains[np.argmax(np.abs(gains))]) or 1.0
 
     def human(self, theta: Array) -> Sequence[Human]:
         """See Twin."""
@@ -256,7 +259,7 @@ class OdeTwin(Head):
         """See Twin. Nothing stays linear behind equations, but for outputs that are sums of their inputs at once."""
         if not join and not forces and self.sums_inputs:
             return self._sums(run, inputs, theta)
-        used = {s: fold(x, theta) for s, x in inputs.items()}
+        used = {s: fold(x, theta, self.input_gain(s, theta)) for s, x in inputs.items()}
         key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window, run.nearby)
         key = (*key, *(x.token for x in used.values()), *((o, p.token) for o, p in run.paths.items()))
         key = (*key, *((f.effect.form, f.target, f.q.tobytes(), f.weights.tobytes(), _settings(f)) for f in forces))
@@ -273,21 +276,24 @@ class OdeTwin(Head):
     @cached_property
     def sums_inputs(self) -> bool:
         """Return True if no state moves and the outputs are affine in the signals."""
-        return self.reads_affine and all(x.name == NO_STATE for x in self.state_list)
+        return self.reads_affine and [x.name for x in self.state_list] == [NO_STATE]
+
+    def _gains(self, theta: Array) -> Array:
+        """Return the gains (q, m) from the signals to outputs that are their sums."""
+        m = len(self.signals)
+        units = np.ascontiguousarray(np.vstack([np.zeros(m), np.eye(m)]))
+        y = self.equations.readings(np.zeros((m + 1, 1)), units, np.zeros(m + 1), self.values(theta))
+        return (y[1:] - y[0]).T
 
     def _sums(self, run: Run, inputs: Mapping[str, Signal], theta: Array) -> dict[str, Signal]:
         """Return outputs that are sums of the inputs and of their columns."""
         plain = {s: Signal(x.value, {}, x.token) for s, x in inputs.items()}
-        values, m = self.values(theta), len(self.signals)
-        none = np.zeros((m + 1, len(self.state_list)))
-        units = np.ascontiguousarray(np.vstack([np.zeros(m), np.eye(m)]))
-        y = self.equations.readings(none, units, np.zeros(m + 1), values)
-        found: dict[str, Signal] = {}
+        gains, found = self._gains(theta), dict[str, Signal]()
         for i, (o, signal) in enumerate(self.respond(run, plain, theta, (), True).items()):
             columns: dict[int, Array] = {}
-            for k, s in enumerate(self.signals):
-                gain = float(y[k + 1, i] - y[0, i])
-                for j, c in inputs[s].columns.items() if s in inputs and gain != 0.0 else ():
+            for s, x in inputs.items():
+                gain = float(gains[i, self.signals.index(s)]) / self.input_gain(s, theta)
+                for j, c in x.columns.items():
                     columns[j] = columns[j] + gain * c if j in columns else gain * c
             found[o] = replace(signal, columns=columns)
         return found
