@@ -14,12 +14,13 @@ from sim_devices.physics.hysteresis import CURVES, FORMS
 from tests.unit.mismatch_engine.cases import RATE, among, named, recording, wave
 from tools.mismatch.engine.evidence import Doubt, absent_groups, doubt_of, holds_zero
 from tools.mismatch.engine.intervals import uncertainty
-from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.pose import Ended, prepared
 from tools.mismatch.engine.report import ParameterValue, Report, Withheld
 from tools.mismatch.engine.screen import places
 from tools.mismatch.infer import decide, diagnose
 from tools.mismatch.infer.borne_out import borne_out as borne_out_of
 from tools.mismatch.infer.constants import learned
+from tools.mismatch.infer.run import is_no_better
 from tools.mismatch.infer.store import Store
 from tools.mismatch.recording import Recording
 
@@ -224,6 +225,15 @@ def test_noise_that_would_be_louder_than_what_was_found_is_a_doubt(
     named = next(s for s in store.sets.values() if s.placed)
     assert decide.judge(store, named, None).whole is whole
     assert not decide.judge(store, store.base, None).whole
+
+
+def test_an_effect_without_which_the_whole_run_is_as_good_is_not_named() -> None:
+    _, _, store = weighed(slow_loop(), "hysteresis")
+    named = next(s.fitted for s in store.sets.values() if s.placed)
+    base = store.base.fitted
+    assert not is_no_better(store.problem, Ended(base, named))
+    assert is_no_better(store.problem, Ended(replace(base, residual=named.residual), named))
+    assert not is_no_better(store.problem, Ended(base, base))
 
 
 def test_a_curve_that_trades_with_a_gain_is_sure_as_a_whole() -> None:

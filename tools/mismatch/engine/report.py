@@ -15,7 +15,9 @@ from hal.jsonable import to_jsonable
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
 Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
 """Meaning of the verdict ``unexplained``; "" for the other verdicts."""
-WithheldReason = Literal["holds_zero", "holds_plain", "at_limit", "below_tolerance", "unlikely", "follows_signal"]
+WithheldReason = Literal[
+    "holds_zero", "holds_plain", "at_limit", "below_tolerance", "unlikely", "follows_signal", "no_better"
+]
 
 
 @dataclass(frozen=True)

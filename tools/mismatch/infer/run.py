@@ -14,9 +14,11 @@ from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import conclude
+from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.hold import with_hold
 from tools.mismatch.engine.identifiability import LeastNamed, experiment
 from tools.mismatch.engine.pose import Ended, Posed, pose, run_through
+from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed, Verdict
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
@@ -130,12 +132,27 @@ def _through(posed: Posed, store: Store, answer: Answer, held_out: float) -> tup
         chosen = answer.chosen if named else store.base
         chosen, ended = best_form(posed, store, chosen, held_out)
         answer = replace(answer, chosen=chosen) if named else answer
-        doubts = doubts_of(posed.problem, ended.fitted) if ended.fitted is not chosen.fitted else []
+        apart = ended.fitted is not chosen.fitted
+        doubts = doubts_of(posed.problem, ended.fitted) if apart else []
+        if apart and not doubts and is_no_better(posed.problem, ended):
+            doubts = [Doubt(k, "no_better", ()) for k in range(len(chosen.placed))]
         if not doubts:
             return answer, decision, chosen, replace(ended, forms=forms_as_good(store, chosen) if named else ())
         # one at a time: without the weakest of two that stand for each other, the other may be certain
         weakest = min(doubts, key=lambda d: effect_size(store, chosen, chosen.placed[d.k].effect.name))
         answer = without_doubted(store, answer, ended.fitted, weakest)
+
+
+def is_no_better(problem: Problem, ended: Ended) -> bool:
+    """Return True if the run that is reported leaves no less of what is held out with the effects than without.
+
+    Events, and courses that no run predicts, are judged by other means.
+    """
+    placed = [p.effect for p in ended.fitted.model.placed]
+    if not placed or any(e.claims is not None or e.stochastic or e.predict is not None for e in placed):
+        return False
+    without, within = (held_rms(ended.official or problem, f) for f in (ended.base, ended.fitted))
+    return sum(math.log(max(within[o], 1e-300) / max(rms, 1e-300)) for o, rms in without.items()) >= 0.0
 
 
 def best_form(posed: Posed, store: Store, chosen: Scored, held_out: float) -> tuple[Scored, Ended]:

@@ -343,6 +343,8 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
         why = "the difference that it makes is below your tolerance"
     elif w.reason == "at_limit":
         why = f"{names} ended at a limit of the search"
+    elif w.reason == "no_better":
+        why = "a run through the whole recording is no better with it"
     elif w.reason == "unlikely":
         why = "beside what is left unexplained it is too likely to be wrong"
     elif w.reason == "follows_signal":
