@@ -96,10 +96,10 @@ def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     x = test_cycle(lo, hi)
     out: list[Human] = []
     # at rest speeds are zero, and what lags has caught up: the first columns alone are left
-    for name, factor, shown in (("slow", 0.05, N_PLAYS + N_DAHL), ("fast", 2.0, None)):
+    for name, factor, columns in (("slow", 0.05, N_PLAYS + N_DAHL), ("fast", 2.0, None)):
         # a triangle of slope factor * usual
         dt = (hi - lo) / (0.5 * CYCLE) / (factor * usual)
-        y = scale * x + _columns(x, dt, p[0], settings, (0,))[:, :shown] @ p[1:][:shown]
+        y = scale * x + _columns(x, dt, p[0], settings, (0,))[:, :columns] @ p[1:][:columns]
         out.append(Human(f"loop_width_share_{name}", loop_width(y, 3), "1"))
     widths = [h.value for h in out]
     change = abs(widths[1] - widths[0]) / max(*widths, 1e-12)

@@ -50,6 +50,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-false-alarms": (),
     "mismatch-foreign": (),
     "mismatch-measured": (),
+    "mismatch-found": (),
     "mismatch-gate": ("First run", "Sealed corpus, walks", "Sure learned", "Start states"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
