@@ -51,7 +51,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-foreign": (),
     "mismatch-measured": (),
     "mismatch-found": (),
-    "mismatch-gate": ("First run", "Sealed corpus, walks", "Sure learned", "Start states"),
+    "mismatch-gate": ("First run", "Sure learned", "Start states", "A draw after measured"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
     "together": ("Not named",),
