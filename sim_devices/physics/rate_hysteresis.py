@@ -122,10 +122,8 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     guess=_guess,
     basis=lambda x, ctx, q, settings: _columns(x, ctx.dt, q[0], settings, ctx.starts),
     report=_report,
-    # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it; that of a
-    # lag is a fortieth as wide at a fortieth of the speed, and is no memory at rest
+    # a loop that is as wide at rest as at speed is rate-independent memory; that of a lag closes at rest
     limits={"change_with_speed": (0.08, 0.95)},
-    # a loop that may close at rest is that of a lag
     vanishes_with=(("loop_width_share_slow",), ("change_with_speed",)),
     plain="hysteresis",
     laws=2,  # a loop and a lag

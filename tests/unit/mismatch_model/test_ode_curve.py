@@ -23,22 +23,18 @@ from tools.mismatch.twins.make import make
 from tools.numbers import rms
 
 RATE_HZ = 100.0
-CURVE = (
-    """
-format = 1
-data = "data.csv"
-rate_hz = 100.0
-[twin]
-kind = "ode"
-hold = "linear"
-[twin.outputs]
-flow = "a * sqrt(max(pressure, 0) + b)"
-[twin.parameters]
-a = 1.8
-b = 0.1
-"""
-    + channel("pressure", "input", "pressure", "kPa")
-    + channel("flow", "output", "flow", "l/min")
+
+
+def described(twin: str, *channels: str) -> str:
+    """Return a descriptor of a curve, ``[twin.outputs]`` and what follows."""
+    head = 'format = 1\ndata = "data.csv"\nrate_hz = 100.0\n[twin]\nkind = "ode"\nhold = "linear"\n'
+    return head + twin + "".join(channels)
+
+
+CURVE = described(
+    '[twin.outputs]\nflow = "a * sqrt(max(pressure, 0) + b)"\n[twin.parameters]\na = 1.8\nb = 0.1\n',
+    channel("pressure", "input", "pressure", "kPa"),
+    channel("flow", "output", "flow", "l/min"),
 )
 
 
@@ -76,23 +72,11 @@ def test_what_is_missing_behind_a_curve_is_named_and_the_corrected_curve_runs_el
     assert rms(flow - recording.outputs["flow"]) < 1.1 * 0.01
 
 
-DAMPER = (
-    """
-format = 1
-data = "data.csv"
-rate_hz = 100.0
-[twin]
-kind = "ode"
-hold = "linear"
-[twin.outputs]
-force = "k * displacement + c * velocity"
-[twin.parameters]
-k = 300.0
-c = 50.0
-"""
-    + channel("displacement", "input", "displacement", "mm")
-    + channel("velocity", "input", "velocity", "mm/s")
-    + channel("force", "output", "force", "N")
+DAMPER = described(
+    '[twin.outputs]\nforce = "k * displacement + c * velocity"\n[twin.parameters]\nk = 300.0\nc = 50.0\n',
+    channel("displacement", "input", "displacement", "mm"),
+    channel("velocity", "input", "velocity", "mm/s"),
+    channel("force", "output", "force", "N"),
 )
 
 
