@@ -17,7 +17,8 @@ from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.memo import Nearby, remember, stored
-from tools.mismatch.twins.ode import PUSHED, inside_of, weight_scale
+from tools.mismatch.twins.ode import inside_of
+from tools.mismatch.twins.ode_inside import PUSHED, weight_scale
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import BETWEEN, between_of
-from tools.mismatch.twins.equations import Place
+from tools.mismatch.twins.ode_inside import Place
 from tools.mismatch.twins.opaque import OpaqueTwin
 
 SAME = "input or output"

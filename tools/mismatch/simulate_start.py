@@ -22,7 +22,8 @@ from tools.mismatch.twins.base import Signal, travelled
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.memo import remember
-from tools.mismatch.twins.ode import PUSHED, inside_of
+from tools.mismatch.twins.ode import inside_of
+from tools.mismatch.twins.ode_inside import PUSHED
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:

@@ -42,8 +42,9 @@ from tools.guest.equations import (
 )  # fmt: skip
 from tools.mismatch.export.effects import FORCES, ForceCode, Slot, force, joined, numbers
 from tools.mismatch.export.motion import bend_code, sum_code
-from tools.mismatch.twins.equations import Place, Programs
-from tools.mismatch.twins.ode import PUSHED, OdeTwin
+from tools.mismatch.twins.equations import Programs
+from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.ode_inside import PUSHED, Place
 from tools.mismatch.twins.ode_run import STEEP
 
 _CALLS = {

@@ -24,7 +24,8 @@ from tools.mismatch.simulate_text import describe
 from tools.mismatch.twins.base import Force
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin, between_of
 from tools.mismatch.twins.dynamic import DynamicTwin
-from tools.mismatch.twins.ode import PUSHED, OdeTwin
+from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.ode_inside import PUSHED
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.twins.static import StaticTwin
 from tools.mismatch.twins.vocabulary import find_user_kind

@@ -10,39 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
-from sim_devices.physics.forces import FLOW, OFFSET, UNCENTRED
+from sim_devices.physics.forces import OFFSET, UNCENTRED
 from tools.errors import RecordingError
-from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.affine import Steps, exact_steps, run_pushed
 from tools.mismatch.twins.base import Balance, Counted, Force, Run, Signal, central_difference, fold, midway
-from tools.mismatch.twins.equations import (
-    NOTHING,
-    Equations,
-    Inside,
-    Linearised,
-    Place,
-    State,
-    linearise,
-)
-from tools.mismatch.twins.feedback import Rows, fastest_of, pack
+from tools.mismatch.twins.equations import Equations, Linearised, State, linearise
 from tools.mismatch.twins.forced import shot_to_repeat
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.holds import Holds
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.memo import Start, remember, stored
-from tools.mismatch.twins.ode_run import JOINT, SWAY, Drive
+from tools.mismatch.twins.ode_inside import NOTHING, PUSHED, VARYING, Inside, Place, pack_inside, substeps_of, sway_of
+from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.ode_start import StartSearch
 from tools.mismatch.twins.vocabulary import NO_STATE
 
-MOST_SUBSTEPS = 200
 FORGOTTEN = 20.0  # least number of time constants in a record; a slower state is set in every stretch
-
-
-PUSHED = ("motion", "joint")
-"""Kinds of places at which a force acts."""
-VARYING = ("parameter", "state", "direction")
-"""Kinds of places at which a parameter is no constant."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +250,7 @@ class OdeTwin(Head):
 
         def make() -> Array:
             x, u = self.states(run, used, theta, forces)
-            readings = self.equations.readings(x, u, run.t, self.values(theta), self.swaying(forces))
+            readings = self.equations.readings(x, u, run.t, self.values(theta), sway_of(forces, self.place))
             return np.ascontiguousarray(readings.T)
 
         with np.errstate(all="ignore"):
@@ -321,68 +305,13 @@ class OdeTwin(Head):
         other, _, target, ratio = place.pairs[:4]
         return -ratio * float(a[int(target), place.position] / a[place.target, int(other)])
 
-    def swaying(self, forces: Sequence[Force]) -> Array:
-        """Return the rows (k, SWAY) of the parameters that vary, in the order of their places."""
-        by: dict[str, list[Array]] = {}
-        for f in forces:
-            if f.effect.fill is not None and self.place(f.target).kind in VARYING:
-                by.setdefault(f.target, []).append(f.effect.fill(f.q, f.weights, f.settings)["sway"])
-        return np.array([row for rows in by.values() for row in rows], np.float64).reshape(-1, SWAY)
-
     def packed(self, forces: Sequence[Force], values: Array) -> Inside:
         """Return forces and flows, packed for the compiled loop; ``values``: the parameters of the equations."""
-        by: dict[str, list[Force]] = {}
-        for f in forces:
-            by.setdefault(f.target, []).append(f)
-        place: list[tuple[int, int, int, int]] = []
-        rows: list[Rows] = []
-        flows: list[Array] = []
-        joints: list[Array] = []
-        for name, here in by.items():
-            filled = [f.effect.fill(f.q, f.weights, f.settings) for f in here if f.effect.fill is not None]
-            flows += [r["flows"].reshape(-1, FLOW) for r in filled if "flows" in r]
-            solid = [f for f, r in zip(here, filled, strict=True) if not {"flows", "sway"} & set(r)]
-            if solid and self.place(name).kind == "joint":
-                p = self.place(name)
-                other, speed, target, ratio = p.pairs[:4]
-                sides = [p.position, p.velocity, p.target, other, speed, target, ratio, self.reaction(p, values)]
-                joints.append(np.array([*sides, *pack(solid).spring]))
-            elif solid:
-                p, row = self.place(name), pack(solid)
-                smooth = bool(np.any(row.spring) or np.any(row.cogging) or row.friction[4])
-                place.append((p.position, p.velocity, p.target, int(smooth)))
-                rows.append(row)
-        return Inside(
-            np.array(place, np.int64).reshape(-1, 4),
-            tuple(rows),
-            np.concatenate(flows) if flows else np.zeros((0, FLOW)),
-            self.swaying(forces),
-            np.array(joints, np.float64).reshape(-1, JOINT),
-            fastest_of(forces),
-        )
+        return pack_inside(forces, self.place, lambda place: self.reaction(place, values))
 
     def substeps(self, dt: float, inside: Inside) -> tuple[int, int]:
-        """Return the steps per sample, and the parts of a step in which a body may stick, slip or turn.
-
-        There are four steps per radian of the fastest mode, two per radian of the stiffest memory (a power of two, so
-        that it seldom changes during a fit) and six per period of cogging. Where friction may stick, or a bristle
-        turn, there are at least two parts per sample and up to eight, for 32 per radian, because a part in which the
-        velocity crosses zero is of second order only.
-        """
-        fastest_per_s = inside.fastest_per_s or self.fastest_per_s
-        sub, parts = int(np.ceil(dt * fastest_per_s / 0.25)), 1
-        for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
-            springs = float(np.sum(np.abs(rows.memory))) + max(float(rows.friction[5]), 0.0)
-            stiff = dt * np.sqrt(springs) / 0.5
-            if stiff > sub:
-                sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
-            if np.any(rows.friction[:3] != 0.0):
-                least = max(2, min(8, int(np.ceil(32 * dt * fastest_per_s))))
-                parts = max(parts, least)
-            if rows.cogging[0] > 0.0 and position != velocity:
-                sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
-        sub = int(np.clip(sub, 1, MOST_SUBSTEPS))
-        return sub, -(-parts // sub)
+        """Return the steps per sample and the parts of a step (``ode_inside.substeps_of``)."""
+        return substeps_of(dt, inside, self.fastest_per_s, self.typical)
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """Return states (n, s) of a free run from start states that the measured samples of each stretch set."""
@@ -391,17 +320,8 @@ class OdeTwin(Head):
         sub, fine = self.substeps(run.dt, inside)
         u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
         limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))
-        starts = np.array(run.starts, np.int64)
-        ends = np.array((*run.starts[1:], run.t.size), np.int64)
-
-        steps = None
-        if self.has_exact_steps and not forces:
-            key = ("steps", values.tobytes())
-            steps = run.lasting.get(key)
-            if not isinstance(steps, Steps):
-                steps = self.exact_steps(run.dt, values)
-                stored(run.lasting, key, steps, steps.ad.nbytes)
-
+        starts, ends = _stretches_of(run)
+        steps = self._steps(run, values) if self.has_exact_steps and not forces else None
         if steps is not None and not np.all(np.isfinite(steps.ad)):
             # a trial of the search at which the equations grow beyond all numbers within a step
             return np.full((run.t.size, len(self.state_list)), np.nan)
@@ -435,41 +355,66 @@ class OdeTwin(Head):
 
         x0 = remember(run.lasting, ("about", run.starts), plain)
         x0 = np.where(np.isfinite(x0), x0, given)
-        reading = remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
+        reading = self._reading(run, values)
         if not np.all(np.isfinite(reading)):
             # a trial at which the outputs have no value, a root of a negative number
             return np.full((run.t.size, len(self.state_list)), np.nan)
-        weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
-        whole = run.setting if self.integrates else None
-        seen = whole
-        if seen is None:
-            stop = np.minimum(starts + run.start_window, ends)
-            seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
         if steps is not None and self.reads_affine and all(p.is_linear for p in run.paths.values()):
-            x = steps.run(x0, u, starts, ends)
-            y = self.equations.readings(x, u, run.t, values)
-            rows = dict(zip(self.outputs, reading, strict=True))
-            ss = start_state(steps.ad, rows, run if self.integrates else replace(run, setting=None))
-            missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
-            x = x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
-            if run.nearby is not None and not run.paths:
-                pushes = self.typical * np.eye(self.typical.size)
-                moved = [np.repeat(push[None, :], starts.size, axis=0) for push in pushes]
-                states = np.stack([run_pushed(steps.ad, np.zeros(x.shape), x0, starts, ends) for x0 in moved], axis=-1)
-                slopes = np.einsum("qi,nij->nqj", weight[:, None] * reading, states[seen])
-                run.nearby.of_stretches.setdefault(starts.tobytes(), Start(x[starts], states, slopes))
-            return x
+            return self._run_affine(run, steps, x0, u, values)
 
         def read(x: Array, u: Array, t: Array) -> Array:
             return self.equations.readings(x, u, t, values, inside.sway)
 
-        search = StartSearch(
-            run, u, starts, ends, seen, whole is not None, self.outputs, weight, self.typical, limits, go, read
-        )
+        seen, whole = self._setting(run)
+        weight = self._weights(run)
+        search = StartSearch(run, u, starts, ends, seen, whole, self.outputs, weight, self.typical, limits, go, read)
         for found in (search.from_nearest, search.from_earlier):
             if (x := found()) is not None:
                 return x
         return search.anew(x0, reading)
+
+    def _steps(self, run: Run, values: Array) -> Steps:
+        """Return the exact steps for these numbers, which runs of one recording share."""
+        key = ("steps", values.tobytes())
+        steps = run.lasting.get(key)
+        if not isinstance(steps, Steps):
+            steps = self.exact_steps(run.dt, values)
+            stored(run.lasting, key, steps, steps.ad.nbytes)
+        return steps
+
+    def _setting(self, run: Run) -> tuple[NDArray[np.int64], bool]:
+        """Return the samples that set start states, and True if these are spread over the stretches."""
+        if self.integrates and run.setting is not None:
+            return run.setting, True
+        starts, ends = _stretches_of(run)
+        stop = np.minimum(starts + run.start_window, ends)
+        return np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)]), False
+
+    def _weights(self, run: Run) -> Array:
+        """Return the weights (q,) of the outputs where they set start states."""
+        return np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
+
+    def _run_affine(self, run: Run, steps: Steps, x0: Array, u: Array, values: Array) -> Array:
+        """Return the states (n, s) of affine equations: from any start states, the best ones are one step away."""
+        starts, ends = _stretches_of(run)
+        reading = self._reading(run, values)
+        x = steps.run(x0, u, starts, ends)
+        y = self.equations.readings(x, u, run.t, values)
+        rows = dict(zip(self.outputs, reading, strict=True))
+        ss = start_state(steps.ad, rows, run if self.integrates else replace(run, setting=None))
+        missed = ss.met(dict(zip(self.outputs, y.T, strict=True)), run.measured)
+        x = x + run_pushed(steps.ad, np.zeros(x.shape), missed, starts, ends)
+        if run.nearby is not None and not run.paths:
+            pushes = self.typical * np.eye(self.typical.size)
+            moved = [np.repeat(push[None, :], starts.size, axis=0) for push in pushes]
+            states = np.stack([run_pushed(steps.ad, np.zeros(x.shape), x0, starts, ends) for x0 in moved], axis=-1)
+            slopes = np.einsum("qi,nij->nqj", self._weights(run)[:, None] * reading, states[self._setting(run)[0]])
+            run.nearby.of_stretches.setdefault(starts.tobytes(), Start(x[starts], states, slopes))
+        return x
+
+    def _reading(self, run: Run, values: Array) -> Array:
+        """Return the slopes (q, s) of the outputs by the states for these numbers."""
+        return remember(run.lasting, ("reading", values.tobytes()), lambda: self.linearised(values).c)
 
     @cached_property
     def has_exact_steps(self) -> bool:
@@ -519,6 +464,11 @@ class OdeTwin(Head):
         return carry
 
 
+def _stretches_of(run: Run) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first sample of each stretch and the one behind its last."""
+    return np.array(run.starts, np.int64), np.array((*run.starts[1:], run.t.size), np.int64)
+
+
 def _settings(force: Force) -> tuple[object, ...]:
     return tuple(sorted(force.settings.items()))
 
@@ -527,17 +477,3 @@ def inside_of(twin: object) -> OdeTwin | None:
     """Return the equations of a twin, plain or corrected; None for a twin of another kind."""
     core = getattr(twin, "core", twin)
     return core if isinstance(core, OdeTwin) else None
-
-
-def weight_scale(unit: str, push: float, size: float, speed: float) -> float:
-    """Return the typical size of a weight: the derivative ``push`` over the size of the quantity that it multiplies.
-
-    That size follows from the ``unit`` of the weight (``{out}`` stands for the unit of the position) and from typical
-    position and velocity.
-    """
-    try:
-        d = units.parse(unit.replace("{out}", "m")).dimension
-    except units.UnitError:
-        return push
-    # weight times column is m/s^2
-    return push / (size ** (1 - d[0]) * (size / speed) ** (d[2] + 2))

@@ -11,15 +11,6 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array
 from tools.mismatch.twins.base import Run
-from tools.mismatch.twins.equations import (
-    LEAST_SHOWN,
-    STATE_STEP,
-    Edges,
-    edges_of,
-    meet_start,
-    slopes_of,
-    start_step,
-)
 from tools.mismatch.twins.memo import Start
 
 Samples = NDArray[np.int64]
@@ -32,6 +23,91 @@ Read = Callable[[Array, Array, Array], Array]
 WORTH_RENEWING = 0.99
 """Square of the misses that another step of the start states would leave, as a share of the present one, below which
 they and their sensitivities are sought anew."""
+
+
+STATE_STEP = 1e-4
+"""Step of a start state, over its typical size, of which its slopes are taken."""
+LEAST_SHOWN = 3e-4  # least singular value of a fitted combination of start states, relative to the largest
+
+Edges = list[tuple[int, int]]
+"""First row of each stretch, and the row behind its last."""
+
+
+def edges_of(rows: NDArray[np.int64], stretches: int) -> Edges:
+    """Return the edges of stretches, of which ``rows`` gives that of each row, in order."""
+    first = np.searchsorted(rows, np.arange(stretches)).tolist()
+    return list(zip(first, [*first[1:], rows.size], strict=True))
+
+
+def start_step(slopes: Array, missed: Array, edges: Edges) -> tuple[Array, Array]:
+    """Return the Gauss-Newton step (stretches, s) of start states and the squares (stretches,) that it should leave.
+
+    ``slopes`` (rows, q, s) of the negative of ``missed`` (rows, q). What the samples do not determine is not moved.
+    """
+    s = slopes.shape[2]
+    columns = [(slopes[a:b].reshape(-1, s), missed[a:b].reshape(-1)) for a, b in edges]
+    gram = np.stack([c.T @ c for c, _ in columns])
+    cross = np.stack([c.T @ y for c, y in columns])
+    whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
+    size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
+    determined = size > LEAST_SHOWN**2 * size[:, -1:]
+    along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
+    turn = np.einsum("kij,kj->ki", ways, np.where(determined, along / np.where(determined, size, 1.0), 0.0))
+    return turn, np.array([np.sum((y - c @ step) ** 2) for (c, y), step in zip(columns, turn, strict=True)])
+
+
+def slopes_of(x0: Array, missed: Array, misses: Callable[[Array], Array], typical: Array) -> Array:
+    """Return the slopes (rows, q, s) of the negative of ``missed`` (rows, q) by each state at the start."""
+    ways = STATE_STEP * typical * np.eye(x0.shape[1])
+    return np.stack([(missed - misses(x0 + way)) / STATE_STEP for way in ways], axis=-1)
+
+
+HALVINGS = 4
+"""Largest number of times that a step of start states is halved until it improves them."""
+WORTH_HALVING = 0.9
+"""Largest square of the misses that a step foretells, as a share of the present one, for which it is halved."""
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a trial that runs away is no better
+def meet_start(
+    x0: Array,
+    misses: Callable[[Array], Array],
+    edges: Edges,
+    typical: Array,
+    limits: tuple[Array, Array],
+    rounds: int = 3,
+) -> Array:
+    """Fit start states (stretches, s) that minimise ``misses`` (rows, q), from ``x0`` on.
+
+    ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton are made.
+    """
+    first = [a for a, _ in edges]
+    of = np.repeat(np.arange(len(edges)), [b - a for a, b in edges])
+
+    def together(e: Array) -> Array:
+        return np.add.reduceat(e, first, axis=0)
+
+    best = misses(x0)
+    for _ in range(rounds):
+        turn, foretold = start_step(slopes_of(x0, best, misses, typical), best, edges)
+        was = now = together(np.sum(best**2, axis=1))
+        behind = np.ones(was.size, np.bool_)
+        for h in range(1 + HALVINGS):
+            moved = np.clip(x0 + typical * np.where(behind, 0.5**h, 0.0)[:, None] * turn, *limits)
+            after = misses(moved)
+            reached = together(np.sum(after**2, axis=1))
+            better = behind & (reached < was)
+            x0 = np.where(better[:, None], moved, x0)
+            best = np.where(better[of][:, None], after, best)
+            now = np.where(better, reached, now)
+            # where a body sticks, a step may lead to another place of rest; elsewhere a whole one is right
+            behind &= ~better & (foretold < WORTH_HALVING * was)
+            if not np.any(behind):
+                break
+        # linear equations need a single step
+        if not np.any((now < 0.999 * was) & (now > foretold + 0.001 * was)):
+            break
+    return x0
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,10 @@ from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, State, linearise, rates_at
+from tools.mismatch.twins.equations import Equations, Programs, State, linearise, rates_at
 from tools.mismatch.twins.holds import STRAIGHT_OR_HELD, read_holds
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
+from tools.mismatch.twins.ode_inside import NOTHING, Place
 from tools.mismatch.twins.ode_run import Drive
 from tools.mismatch.twins.program import parse
 from tools.numbers import is_finite_number
