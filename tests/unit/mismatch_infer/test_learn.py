@@ -31,7 +31,7 @@ SHORT = 3.0
 
 
 def _set(names: str, gain: float, parameters: int = 2, z: float | None = 9.0, rest: float = 0.0) -> SetTraits:
-    return SetTraits(frozenset(names), (SHORT - gain,), parameters, 0.0, z if names else None, rest, 1.0)
+    return SetTraits(frozenset(names), (SHORT - gain,), parameters, len(names), 0.0, z if names else None, rest, 1.0)
 
 
 def _cases(rng: np.random.Generator, count: int, form_error: float) -> list[Case]:
@@ -138,6 +138,10 @@ def test_what_is_learned_from_decides_as_the_engine_does() -> None:
     said, chosen = case.says(START)
     assert chosen.names == answer.chosen.names == {"saturation"}
     assert said == ("named" if answer.whole else "unexplained")
+    scores = {s.names: inferred.found.store.score(s) for s in inferred.found.store.ranked()}
+    sets = [s for s in case.ranked(START) if s.names in scores]
+    assert any(s.laws > len(s.names) for s in sets)
+    assert [case.score(s, START) for s in sets] == pytest.approx([scores[s.names] for s in sets])
 
 
 def test_a_calibration_goes_on_where_it_was(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ class SetTraits:
     names: frozenset[str]
     short: tuple[float, ...]
     parameters: float
+    laws: int
     choices: float
     z: float | None
     rest: float | None
@@ -72,7 +73,7 @@ class SetTraits:
         """Return the score as ``Store.score`` does."""
         count = Count.of(c, held)
         lost = sum(count.lost(v) for v in self.short) / outputs
-        return -lost - c.per_name * len(self.names) - self.choices - c.per_parameter * self.parameters
+        return -lost - c.per_name * self.laws - self.choices - c.per_parameter * self.parameters
 
 
 def traits_of(inferred: Inferred) -> dict[str, Any]:
@@ -95,7 +96,7 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         "outputs": store.outputs,
         "sets": [
             {"names": sorted(s.names), "short": [*store.short(s).values()], "parameters": s.parameters,
-             "choices": s.choices, "tested": weakest.get(s.key), "left": leaves.get(s.key),
+             "laws": s.laws, "choices": s.choices, "tested": weakest.get(s.key), "left": leaves.get(s.key),
              "events": events.get(s.key, {})}
             for s in [*kept[:SETS], *([] if store.base in kept[:SETS] else [store.base])]
         ],
@@ -128,6 +129,7 @@ def sets_of(traits: Traits) -> list[SetTraits]:
                 names,
                 tuple(s["short"]),
                 float(s["parameters"]),
+                int(s["laws"]),
                 float(s["choices"]),
                 passed.get(names),
                 rest,
