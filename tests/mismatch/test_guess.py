@@ -28,6 +28,8 @@ from tools.mismatch.recording_load import load
         ("dilution_1_h", ("dilution", "1/h")), ("feed_g_l", ("feed", "g/l")), ("flow_l_min", ("flow", "l/min")),
         ("charge_A_h", ("charge", "Ah")), ("x_V_min", ("x_V_min", "")), ("pump_1_s", ("pump_1", "s")),
         ("clock_in_s", ("clock_in", "s")), ("heater_pct", ("heater", "%")), ("force_klbf", ("force", "klbf")),
+        ("CO(GT)", ("CO(GT)", "")), ("field_mT", ("field", "mT")), ("p_hPa", ("p", "hPa")),
+        ("speed_rps", ("speed", "rps")),
         ("force_N_l", ("force_N_l", "")), ("pump_1_l", ("pump_1_l", "")), ("flow_m3_h", ("flow", "m3/h")),
     ],
 )  # fmt: skip
@@ -105,7 +107,7 @@ def test_a_staircase_drives_and_noisy_columns_answer_whatever_their_units(tmp_pa
     current, voltage = 3 * lag(DUTY, 0.9) + 0.02 * NOISE[0], 12 * lag(DUTY, 0.97) + 0.03 * NOISE[1]
     roles, assumed = roles_of(tmp_path, "t_s,duty,iL_A,vout_V,sink_degC", DUTY, current, voltage, 20 + 1e-3 * K)
     assert roles == {"duty": "input", "iL_A": "output", "vout_V": "output", "sink_degC": "context"}
-    assert assumed[:3] == ["inputs are 'duty'", "outputs are 'iL_A'", "context is 'sink_degC'"]
+    assert assumed[:3] == ["inputs are 'duty'", "outputs are 'iL_A', 'vout_V'", "context is 'sink_degC'"]
 
 
 @pytest.mark.parametrize("laser", [np.minimum(K // 500, 5), DUTY])
@@ -276,3 +278,42 @@ def test_the_command_prints_json(tmp_path: Path, capsys: pytest.CaptureFixture[s
     t = np.arange(100) / 10.0
     assert main([str(table(tmp_path, "t_s,command_V,z_um", t, t, t))]) == 0
     assert json.loads(capsys.readouterr().out)["kind"] == "piezo_stack"
+
+
+def test_a_logger_file_with_dates_and_two_equal_names(tmp_path: Path):
+    """TOA5: four rows above the samples; the names stand in the second, the units in the third."""
+    head = '"TOA5","CR1000","rig"\n"TIMESTAMP","RECORD","block_degC","heater","batt","batt"\n"TS","RN","","W","V","V"\n'
+    head += '"","","Avg","Smp","Min","Max"\n'
+    rows = [
+        f'"2026-01-01 {k // 60:02d}:{k % 60:02d}:00",{k},{20 + np.sin(k / 9):.3f},{(k // 20) % 2 * 5},12.3,12.4\n'
+        for k in range(200)
+    ]
+    (tmp_path / "toa5.csv").write_text(head + "".join(rows))
+    found = guess(tmp_path / "toa5.csv")
+    assert found.rate_hz == pytest.approx(1 / 60)
+    assert {c.name: c.role for c in found.columns} == {
+        "TIMESTAMP": "time", "RECORD": "", "block_degC": "output", "heater": "input",
+    }  # fmt: skip
+    assert "column 'batt' is not used: more than one has this name" in found.notes
+
+
+def test_a_date_in_another_form_is_told_the_one_that_is_read(tmp_path: Path):
+    rows = "".join(f"10/03/2004;{k};{np.sin(k)};{np.cos(k)}\n" for k in range(80))
+    (tmp_path / "a.csv").write_text(f"Date;t_s;u_V;y_mm\n{rows}")
+    (note,) = (n for n in guess(tmp_path / "a.csv").notes if "Date" in n)
+    assert note.endswith("a date is read as 2026-03-10 18:00:00, with the time of day, in one column")
+
+
+@pytest.mark.parametrize(("mark", "told"), [(-200.0, True), (-1.0, False), (3.0, False)])
+def test_a_number_that_marks_missing_values_is_told(tmp_path: Path, mark: float, told: bool):
+    t = np.arange(400) / 10.0
+    y = np.where(np.arange(400) % 50 < 3, mark, 20 + np.sin(t))
+    found = guess(table(tmp_path, "t_s,u_V,y_mm", t, np.sin(t), y))
+    assert any("column 'y_mm' is -200 in 24 samples" in n for n in found.notes) == told
+
+
+def test_what_is_in_degrees_is_the_temperature_beside_other_outputs(tmp_path: Path):
+    t = np.arange(400) / 10.0
+    columns = (t, np.sin(t), np.cos(t), 20 + t, 21 + t)
+    found = guess(table(tmp_path, "t_s,u_V,y_mm,air_degC,room_degC", *columns))
+    assert [c.signal for c in found.columns if c.role == "context"] == ["temperature", "room"]

@@ -210,7 +210,7 @@ def new(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="A data file: .csv, .txt, .npz, .mat and others.")],
     twin: Annotated[str, typer.Option("--twin", metavar="KIND", help="The kind of twin; default: guessed.")] = "",
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.toml", help="Default: recording.toml beside DATA.")
+        Path | None, typer.Option("--out", metavar="FILE.toml", help="Default: recording.toml; in the folder of DATA.")
     ] = None,
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Rate of the samples, in place of a column of time.")
@@ -424,6 +424,11 @@ def simulate(
         from tools.mismatch.simulate_bounds import run_bounded
 
         loaded = load(recording or twin, data)
+
+        def run() -> dict[str, Array]:
+            return simulate_own(loaded) if recording is None else simulate_file(twin, loaded)
+
+        simulated = run_bounded(twin, loaded, run)  # a fault of the twin is told alone
         for line in as_read(loaded):
             _print_read(line)
         left_out = columns_left_out(recording or twin)
@@ -432,11 +437,6 @@ def simulate(
             console().print(
                 f"columns not used: {', '.join(left_out[:MOST_NAMED])}{more}", highlight=False, markup=False
             )
-
-        def run() -> dict[str, Array]:
-            return simulate_own(loaded) if recording is None else simulate_file(twin, loaded)
-
-        simulated = run_bounded(twin, loaded, run)
         rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
             write_text_atomic(out, columns(loaded, simulated))

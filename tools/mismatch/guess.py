@@ -47,7 +47,7 @@ from tools.mismatch.recording_columns import (
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.stamps import StampReader, Stamps
-from tools.mismatch.text_table import BLOCK_ROWS
+from tools.mismatch.text_table import A_DATE, BLOCK_ROWS
 from tools.mismatch.twins.vocabulary import KINDS, vocabulary
 
 POINTS = 240
@@ -56,9 +56,14 @@ MOST_COLUMNS = 200
 _PART = 256
 """Rows per part of a file that is longer than one block."""
 _TIME = re.compile(r"^(t|time|time[ _-]?stamps?|seconds|secs?|zeit|elapsed([ _-]?time)?|.*log_time)$", re.IGNORECASE)
-_NUMBER = re.compile(r"^(i|k|n|index|idx|samples?|sample[ _]?(no|number|index)|no|nr|row|count)\.?$", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"^(i|k|n|index|idx|samples?|sample[ _]?(no|number|index)|no|nr|row|count|record)\.?$", re.IGNORECASE
+)
 _RATE = re.compile(r"^(.*\.)?(fs|f_s|rate|sampl(e|ing)_?(rate|freq|frequency))(_?hz)?$", re.IGNORECASE)
 _STEP = re.compile(r"^(.*\.)?(ts|t_s|dt|sampl(e|ing)_?(time|period))(_s)?$", re.IGNORECASE)
+_LIKE_A_DATE = re.compile(r"^\d{1,4}[./:-]\d{1,2}[./:-]\d{1,4}\b")
+_MARKS = (-200.0, -99.0, -999.0, -9999.0, 999.0, 9999.0, 99999.0, -32768.0, 32767.0, 65535.0)
+"""Numbers that files write where a value is missing."""
 _UNNAMED = re.compile(r"^column_\d+$")
 
 
@@ -116,6 +121,10 @@ class _Column:
     largest: float = float("-inf")
     course: Course = ""
     """The course in the first block in which the values change."""
+    marks: dict[float, int] = field(default_factory=dict[float, int])
+    """How often each of ``_MARKS`` stands in the column, and the range of its other values."""
+    inner_low: float = float("inf")
+    inner_high: float = float("-inf")
 
     def add(self, values: Array, at: int, parts: int) -> None:
         finite = np.isfinite(values)
@@ -128,8 +137,25 @@ class _Column:
             self.course = course_of(values)
         self.low.append(low)
         self.high.append(high)
+        is_mark = np.isin(values, _MARKS)
+        for mark in _MARKS if is_mark.any() else ():
+            self.marks[mark] = self.marks.get(mark, 0) + int(np.sum(values == mark))
+        inner = values[finite & ~is_mark]
+        self.inner_low = min(self.inner_low, float(np.min(inner, initial=np.inf)))
+        self.inner_high = max(self.inner_high, float(np.max(inner, initial=-np.inf)))
         self.smallest = min(self.smallest, float(np.nanmin(low, initial=np.inf)))
         self.largest = max(self.largest, float(np.nanmax(high, initial=-np.inf)))
+
+    def mark(self) -> float | None:
+        """Return the number that seems to mark missing values: repeated, and farther off than the others reach."""
+        width = self.inner_high - self.inner_low
+        return next(
+            (
+                m for m, count in self.marks.items()
+                if count > 1 and width > 0.0 and max(self.inner_low - m, m - self.inner_high) > width
+            ),
+            None,
+        )  # fmt: skip
 
 
 def guess(path: Path, kind: str = "") -> Guess:
@@ -140,14 +166,26 @@ def guess(path: Path, kind: str = "") -> Guess:
     names = _names(path)
     file_units = column_units(path)
     parts = {k: (k, file_units[k]) if units.is_unit(file_units.get(k)) else _split(k) for k in names}
-    words = words_in(path)
-    notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
+    twice = [k for k in dict.fromkeys(names) if names.count(k) > 1]
+    names = [k for k in names if k not in twice]
+    notes = [f"column '{k}' is not used: more than one has this name" for k in twice]
+    notes += [
+        f"column '{name}' is not used: it holds words ('{first}')"
+        + (f"; a date is read as {A_DATE}, with the time of day, in one column" if _LIKE_A_DATE.match(first) else "")
+        for name, first in words_in(path)
+    ]
     unknown_units = {k: u for k, u in file_units.items() if u and not units.is_unit(u)}
     notes += [f"column '{k}': its unit '{u}' in the file is not known" for k, u in unknown_units.items()]
     row = first_line(path)
     seen, stamps, clock, n, assumed = _scan(path, names, parts, row)
     if n < 2:
         raise RecordingError(f"{path}: {n} samples; a recording needs at least {MIN_SAMPLES}")
+    notes += [
+        f"column '{k}' is {mark:g} in {c.marks[mark]} samples, far from its other values; if that marks a missing one,"
+        " leave those cells empty"
+        for k, c in seen.items()
+        if (mark := c.mark()) is not None
+    ]
     left = _candidates(names, parts, seen, clock, n, notes)
     if len(left) < 2:
         remarks = f" ({'; '.join(notes)})" if notes else ""

@@ -35,6 +35,7 @@ _WORDS: tuple[tuple[GuessedRole, str], ...] = (
 )
 _SURROUNDINGS = r"supply|ambient|room|humid|status|flag|state"
 """Names of context that stay context where no other column could answer."""
+TEMPERATURE = "temperature"
 _SIMULATED = re.compile(
     r"^(?:sim(?:ulated)?|model)[_\W]+|[_\W]+(?:sim(?:ulated)?|model)(?:[)\]]|(?=[_\W]|$))", re.IGNORECASE
 )
@@ -192,7 +193,7 @@ def assign(
             notes.append(f"column '{name}' is not used: '{rival}' is the {found.signals[rival]} already")
             continue
         found.roles[name] = "context"
-        found.signals[name] = _unused(_context_signal(plain, unit), found.signals)
+        found.signals[name] = _context_signal(plain, unit, found.signals)
         if hints[name] != "context":
             notes.append(f"column '{name}' is context: a {kind} has no other place for it")
     for name in dropped:
@@ -310,7 +311,8 @@ def _assign_freely(
     for asides in (_WORDS[0][1], _SURROUNDINGS):  # a heater: the last temperatures are no context, unless named so
         if len(used) < 2:
             inside = [k for k in names if roles[k] == "context" and not re.search(asides, parts[k][0], re.IGNORECASE)]
-            roles |= dict.fromkeys(inside[len(used) - 2 :], "")
+            answers = len(used) == 1 and roles[used[0]] != "output"
+            roles |= dict.fromkeys(inside[len(used) - 2 :], "output" if answers else "")
             used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
@@ -325,13 +327,14 @@ def _assign_freely(
     notes = tuple(f"column '{name}' is context: no column is its simulated course" for name in alone)
     sure = {name for name in names if role_of_name(parts[name][0]) == roles[name]} | {*courses}
     phrases = {"input": "inputs are", "output": "outputs are", "context": "context is"}
-    guessed = {phrase: [k for k in names if roles[k] == role and k not in sure] for role, phrase in phrases.items()}
-    assumed = [f"{phrase} {_quoted(of)}" for phrase, of in guessed.items() if of]
+    by_role = {phrase: [k for k in names if roles[k] == role] for role, phrase in phrases.items()}
+    assumed = [f"{phrase} {_quoted(of)}" for phrase, of in by_role.items() if not sure.issuperset(of)]
     signals: dict[str, str] = {}
     for name in names:
         plain, unit = parts[name]
-        own = _context_signal(plain, unit) if roles[name] == "context" else word(plain)
-        signals[name] = _unused(own, signals)
+        signals[name] = (
+            _context_signal(plain, unit, signals) if roles[name] == "context" else _unused(word(plain), signals)
+        )
     for name, output in simulated.items():
         signals[name] = f"simulated_{signals[output]}"
     return Assignment(roles, signals, sum(bool(guess_role(*parts[k])) for k in used), notes, tuple(assumed))
@@ -342,13 +345,19 @@ def word(plain: str) -> str:
     return re.sub(r"\W+", "_", plain).strip("_") or "signal"
 
 
-def _context_signal(plain: str, unit: str) -> str:
-    """Return the signal of the contract that the name means, where the unit goes with it, else the name."""
+def _context_signal(plain: str, unit: str, used: Mapping[str, str]) -> str:
+    """Return the signal of the contract that the name means, where the unit goes with it, else the name.
+
+    What is in degrees is the temperature, whatever it is called, if no column is so yet.
+    """
     for signal, known in CONTEXT_UNITS.items():
-        if signal[:4] in plain.lower() and (not unit or any(units.same_dimension(unit, u) for u in known)):
+        fits = any(units.same_dimension(unit, u) for u in known) if unit else True
+        if signal[:4] in plain.lower() and fits:
+            return _unused(signal, used)
+        if signal == TEMPERATURE and unit and fits and signal not in used.values():
             return signal
     own = word(plain)
-    return f"{own}_beside" if own in CONTEXT_UNITS else own
+    return _unused(f"{own}_beside" if own in CONTEXT_UNITS else own, used)
 
 
 def _unused(own: str, signals: Mapping[str, str]) -> str:

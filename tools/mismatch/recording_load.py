@@ -68,6 +68,8 @@ def from_table(
         words = Vocabulary(open_ended=True)
     refuse_unknown_keys(f"{where}:", text, TOP_KEYS)
     notes: list[str] = []
+    if data is not None and text.get("segments"):
+        notes.append(f"segments are those of {data_name}; {data} is one run")
     if data is not None:
         text = {key: value for key, value in text.items() if key not in ("split", "segments")}
     data_path = path if columns is not None else data or path_inside(path, str(data_name))

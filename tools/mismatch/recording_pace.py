@@ -13,7 +13,9 @@ import numpy as np
 
 from hal.trust import NotTrusted
 from tools.errors import RecordingError
+from tools.mismatch.guess_roles import split_clock
 from tools.mismatch.recording import Array, Recording
+from tools.mismatch.twins.vocabulary import NO_STATE
 
 FAR_APART = 2.0
 """Distance of two samples, in slowest time constants of the twin, from which on the time column is doubted."""
@@ -28,11 +30,13 @@ def pace_note(recording: Recording, time_column: str) -> str:
     if rates.size == 0 or recording.dt * rates.min() < FAR_APART:
         return ""
     slowest_s = 1.0 / float(rates.min())
-    return (
-        f"column '{time_column}' is read as seconds, {recording.dt:.3g} s a sample; the twin's slowest time constant"
-        f" ({slowest_s:.2g} s) is {recording.dt / slowest_s:.2g} times shorter. If the column is in ms, write"
-        f" rate_hz = {1e3 / recording.dt:.6g} in place of time_column"
+    found = (
+        f"by column '{time_column}' the samples are {recording.dt:.3g} s apart; the twin's slowest time constant"
+        f" ({slowest_s:.2g} s) is {recording.dt / slowest_s:.2g} times shorter"
     )
+    if split_clock(time_column)[1]:  # its name states the unit
+        return f"{found}; check the units of the twin's time constants"
+    return f"{found}. If the column is in ms, write rate_hz = {1e3 / recording.dt:.6g} in place of time_column"
 
 
 def _rates_per_s(recording: Recording) -> Array:
@@ -50,6 +54,8 @@ def _rates_per_s(recording: Recording) -> Array:
             try:
                 twin = ode_twin(recording)
             except (RecordingError, NotTrusted):  # a later step reports the fault
+                return np.zeros(0)
+            if [x.name for x in twin.state_list] == [NO_STATE]:
                 return np.zeros(0)
             return _moduli(twin.linearised(twin.start_values).a)
         case _:

@@ -53,6 +53,8 @@ def read_segments(path: Path, value: object, n: int, kind: str, resampled: bool)
     if value is None:
         return ()
     lengths = np.diff([0, *begins, n])
+    if 0 in begins:
+        raise RecordingError(f"{path}: segments {value}: the first run begins at 0 in any case; leave the 0 out")
     if np.any(lengths < MIN_SPAN):
         raise RecordingError(
             f"{path}: segments {value} leave a run of {int(lengths.min())} of the {n} samples; each needs {MIN_SPAN},"

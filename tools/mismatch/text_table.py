@@ -1,5 +1,7 @@
 """Reads tables of numbers in text files: any delimiter, decimal comma or point, optional header and row of units.
 
+Dates with a time of day as ISO 8601 writes them are seconds since 1970.
+
 The form is found from the first part of the file. Rows are read in blocks, so that a file may be larger than memory.
 """
 
@@ -11,6 +13,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
@@ -29,6 +32,9 @@ MISSING = frozenset(("", "nan", "na", "n/a", "-", "--", "null", "none"))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 _COMMENT = ("#", "%")
+A_DATE = "2026-03-10 18:00:00"
+"""A date as it is read."""
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?Z?")
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,8 @@ class TextTable:
 
     ``delimiter``: None stands for blanks. ``names``: one per column, ``column_1`` and so on without a header.
     ``units``: from a row of units below the header, else empty. ``text``: columns that hold words instead of numbers,
-    with the first of them. ``first``: the line of the first sample, counted from 1; ``samples``: whether it is there.
+    with the first of them; ``dates``: columns of dates. ``first``: the line of the first sample, counted from 1;
+    ``samples``: whether it is there.
     """
 
     path: Path
@@ -47,6 +54,7 @@ class TextTable:
     names: tuple[str, ...]
     units: tuple[str, ...]
     text: tuple[tuple[str, str], ...]
+    dates: tuple[str, ...]
     first: int
     samples: bool
 
@@ -65,7 +73,7 @@ class TextTable:
             if name not in self.names:
                 raise missing_column(self.path, name, list(self.names))
             if self.names.count(name) > 1:
-                raise RecordingError(f"{self.path}: line 1: column '{name}' appears twice; rename one")
+                raise RecordingError(f"{self.path}: two columns are named '{name}'; rename one in the header")
         use = [self.names.index(name) for name in names]
         if not self.samples:
             raise RecordingError(f"{self.path}: no line of numbers below the header; is the file complete?")
@@ -85,6 +93,9 @@ class TextTable:
         return {name: np.concatenate([p[:, i] for p in parts]) for i, name in enumerate(names)}
 
     def _numbers(self, numbered: list[tuple[int, str]], use: list[int]) -> Array:
+        of_dates = [self.names[i] in self.dates for i in use]
+        if any(of_dates):
+            return self._with_dates(numbered, use, of_dates)
         lines = [text for _, text in numbered]
         if self.decimal == ",":
             lines = [text.replace(",", ".") for text in lines]
@@ -92,6 +103,31 @@ class TextTable:
             return np.loadtxt(lines, np.float64, None, self.delimiter, usecols=use, ndmin=2, quotechar='"')
         except ValueError:
             return np.array([self._row(number, text, use) for number, text in numbered])
+
+    def _with_dates(self, numbered: list[tuple[int, str]], use: list[int], of_dates: list[bool]) -> Array:
+        """Return the values (rows, use), of which some are dates."""
+        found = np.empty((len(numbered), len(use)))
+        plain = [i for i, is_date in zip(use, of_dates, strict=True) if not is_date]
+        if plain:
+            found[:, ~np.array(of_dates)] = self._numbers(numbered, plain)
+        for k in np.flatnonzero(of_dates):
+            found[:, k] = [self._seconds(number, line, use[k]) for number, line in numbered]
+        return found
+
+    def _seconds(self, number: int, line: str, column: int) -> float:
+        """Return the date in a line in seconds since 1970."""
+        cells = _cells(line, self.delimiter)
+        cell = cells[column] if column < len(cells) else ""
+        if cell.lower() in MISSING:
+            return float("nan")
+        try:
+            found = datetime.fromisoformat(cell)
+        except ValueError:
+            raise RecordingError(
+                f"{self.path}: line {number}: column '{self.names[column]}': '{cell[:40]}' is no date like {A_DATE};"
+                " correct the line"
+            ) from None
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
 
     def _row(self, number: int, line: str, use: list[int]) -> list[float]:
         cells = _cells(line, self.delimiter)
@@ -128,7 +164,7 @@ def text_table(path: Path) -> TextTable:
     rows = [(number, _cells(line, delimiter), line) for number, line in lines]
     plain = [row for row in rows if not row[2].lstrip().startswith(_COMMENT)]
     if not plain:
-        return TextTable(path, encoding, delimiter, decimal, (), (), (), 1, False)
+        return TextTable(path, encoding, delimiter, decimal, (), (), (), (), 1, False)
     last = [cells for _, cells, _ in plain[-max(1, len(plain) // 2) :]]
     width = max({len(c) for c in last}, key=[len(c) for c in last].count)
     of_numbers = [sum(_is_number(c[i], decimal) for c in last if len(c) == width) > 0 for i in range(width)]
@@ -142,15 +178,22 @@ def text_table(path: Path) -> TextTable:
         names.pop()
     names = [name or f"column_{i + 1}" for i, name in enumerate(names)]
     row = plain[begin][1] if begin < len(plain) else []
+    dates = tuple(
+        name for i, name in enumerate(names)
+        if i < len(row) and any(of_numbers) and _DATE.fullmatch(row[i])
+    )  # fmt: skip
     words = [
         (name, row[i])
         for i, name in enumerate(names)
-        if i < len(row) and any(of_numbers) and i < width and not of_numbers[i]
+        if i < len(row) and any(of_numbers) and i < width and not of_numbers[i] and name not in dates
         and any(c[i].lower() not in MISSING for c in last if len(c) > i)
     ]  # fmt: skip
-    column_units = (*row_of_units, *[""] * len(names))[: len(names)]
+    given = (*row_of_units, *[""] * len(names))[: len(names)]
+    column_units = tuple("s" if name in dates else unit for name, unit in zip(names, given, strict=True))
     samples = begin < len(plain)
-    return TextTable(path, encoding, delimiter, decimal, tuple(names), column_units, tuple(words), first, samples)
+    return TextTable(
+        path, encoding, delimiter, decimal, tuple(names), column_units, tuple(words), dates, first, samples
+    )
 
 
 def _head(path: Path) -> tuple[str, str, bool]:
@@ -251,6 +294,8 @@ def _header(
 
     row_of_units: list[str] = []
     names = parts(above[-1][1])
+    if len(above) == len(_TOA5) and parts(above[0][1])[0] == "TOA5":
+        return parts(above[1][1]), parts(above[2][1])
     if len(above) > 1 and len(names) == width and len(parts(above[-2][1])) == width and _are_units(names):
         row_of_units = [cell.strip("[]() ") for cell in names]
         names = parts(above[-2][1])
@@ -261,6 +306,10 @@ def _header(
     if above[-1][1].lstrip().startswith(_COMMENT) or len(names) < 2:
         return [], []
     return names, []
+
+
+_TOA5 = ("environment", "names", "units", "processing")
+"""Rows above the samples of a logger (Campbell Scientific, LoggerNet manual, appendix B, "TOA5")."""
 
 
 def _are_units(cells: list[str]) -> bool:

@@ -69,6 +69,7 @@ _SYMBOLS = MappingProxyType(
         "W": (_d(m=2, kg=1, s=-3), 1.0, 0.0, True),
         "Wh": (_d(m=2, kg=1, s=-2), 3600.0, 0.0, True),
         "Pa": (_d(m=-1, kg=1, s=-2), 1.0, 0.0, True),
+        "hPa": (_d(m=-1, kg=1, s=-2), 1e2, 0.0, False),
         "bar": (_d(m=-1, kg=1, s=-2), 1e5, 0.0, True),
         "barg": (_d(m=-1, kg=1, s=-2), 1e5, 0.0, True),  # a difference to the pressure around
         "psi": (_d(m=-1, kg=1, s=-2), 6894.757293168361, 0.0, False),
@@ -99,6 +100,7 @@ _SYMBOLS = MappingProxyType(
         "kn": (_d(m=1, s=-1), 1852.0 / 3600.0, 0.0, False),
         "mph": (_d(m=1, s=-1), 0.44704, 0.0, False),
         "rpm": (_d(s=-1, rad=1), 2 * math.pi / 60, 0.0, False),
+        "rps": (_d(s=-1, rad=1), 2 * math.pi, 0.0, False),
         "count": (_d(count=1), 1.0, 0.0, False),
         "counts": (_d(count=1), 1.0, 0.0, False),
         "tick": (_d(count=1), 1.0, 0.0, False),
@@ -182,7 +184,8 @@ def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
         return direct[0], direct[1], direct[2]
     prefix, rest = symbol[:1], symbol[1:]
     entry = _SYMBOLS.get(rest)
-    if prefix in _PREFIXES and entry is not None and entry[3]:
+    # no field has a thousand tesla: CO(GT) is a ground truth
+    if prefix in _PREFIXES and entry is not None and entry[3] and not (rest == "T" and _PREFIXES[prefix] > 1.0):
         return entry[0], entry[1] * _PREFIXES[prefix], 0.0
     where = f" (symbol '{symbol}')" if symbol != text else ""
     raise UnitError(f"unknown unit '{text}'{where}; known, with powers and SI prefixes: {listed()}")

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from tests.recording_text import channel
 from tools.cli.main import app
+from tools.errors import RecordingError
 from tools.mismatch.export.run import as_read
 from tools.mismatch.recording_load import load
 
@@ -72,7 +73,7 @@ def test_a_hold_is_printed_for_kinds_that_have_one(tmp_path: Path) -> None:
     lines = as_read(load(_recorded(tmp_path, COLUMNS, 0.0)))
     assert "inputs: simulated_x (mm)" in lines
     lines = as_read(load(_recorded(tmp_path, SLIDING, 0.0)))
-    assert "inputs: force (N, hold not given)" in lines
+    assert "inputs: force (N, hold not given, straight)" in lines
 
 
 def test_the_parameters_are_printed_as_they_were_read(tmp_path: Path) -> None:
@@ -136,7 +137,32 @@ def test_matrices_that_cannot_be_read_have_no_poles(tmp_path: Path) -> None:
 def test_a_simulation_that_is_further_off_than_the_mean_is_said_to_be(tmp_path: Path) -> None:
     line, row = _simulated(_recorded(tmp_path, COLUMNS, 50.0))
     assert row["share"] > 1.0
-    assert line.endswith("its mean alone would be closer; check units, signs and offsets")
+    assert line.endswith(
+        "its mean alone would be closer; check units, signs and offsets (where a plant integrates, small errors add up)"
+    )
     line, row = _simulated(_recorded(tmp_path, COLUMNS, 0.001))
     assert row["share"] < 1.0
     assert "closer" not in line
+
+
+def test_a_misspelt_name_is_told_alone(tmp_path: Path) -> None:
+    text = SLIDING.replace('"mechanical_axis"', '"ode"\nback_emf = 0.1\noutputs = { position = "backemf * force" }')
+    ran = CliRunner().invoke(app, ["mismatch", "simulate", str(_recorded(tmp_path, text, 0.0))])
+    assert ran.exit_code == 2
+    assert "'backemf' is no state, input or parameter" in ran.stderr
+    assert "inputs:" not in ran.stderr
+    assert "note:" not in ran.stderr
+
+
+def test_segments_of_one_file_are_not_those_of_another(tmp_path: Path) -> None:
+    folder = _recorded(tmp_path, SLIDING.replace("[twin]", "segments = [100]\n[twin]", 1), 0.0)
+    whole = load(folder)
+    other = load(folder, folder / "data.csv")
+    assert (whole.segments, other.segments) == ((100,), ())
+    assert any(note.startswith("segments are those of ") for note in other.warnings)
+
+
+def test_a_first_segment_at_zero_is_told_to_be_left_out(tmp_path: Path) -> None:
+    text = SLIDING.replace("[twin]", "segments = [0, 100]\n[twin]", 1)
+    with pytest.raises(RecordingError, match="the first run begins at 0 in any case; leave the 0 out"):
+        load(_recorded(tmp_path, text, 0.0))

@@ -55,6 +55,24 @@ def test_a_row_of_units(tmp_path: Path):
     assert (table.names, table.units, table.first) == (("time", "force", "path"), ("s", "N", "mm"), 3)
 
 
+def test_dates_are_seconds(tmp_path: Path):
+    rows = "".join(f"2026-03-10T10:{k // 60:02d}:{k % 60:02d}.250,{k}.5\n" for k in range(90))
+    (tmp_path / "a.csv").write_text(f"when,y\n{rows}")
+    table = text_table(tmp_path / "a.csv")
+    assert (table.columns, table.dates, table.units, table.text) == (["when", "y"], ("when",), ("s", ""), ())
+    found = table.read(["y", "when"])
+    np.testing.assert_array_equal(found["when"], 1773136800.25 + np.arange(90))
+    np.testing.assert_array_equal(found["y"], 0.5 + np.arange(90))
+
+
+def test_a_broken_date_is_named_with_its_line(tmp_path: Path):
+    rows = [f"2026-03-10 10:00:{k:02d},{k}\n" for k in range(60)]
+    rows[7] = "2026-03-10 10:00:61,7\n"
+    (tmp_path / "a.csv").write_text("when,y\n" + "".join(rows))
+    with pytest.raises(RecordingError, match=r"line 9: column 'when': '2026-03-10 10:00:61' is no date like"):
+        text_table(tmp_path / "a.csv").read(["when"])
+
+
 def test_columns_of_words_are_named_and_left_out(tmp_path: Path):
     (tmp_path / "a.csv").write_text("t,state,y\n" + "".join(f"{k},running,{k}.5\n" for k in range(60)))
     table = text_table(tmp_path / "a.csv")

@@ -132,6 +132,24 @@ def test_a_time_in_ms_under_a_bare_name_is_noticed(tmp_path: Path, kind: str, is
     assert all("rate_hz = 100 in place of time_column" in note for note in notes)
 
 
+CURVE = 'outputs = { y = "gain * u" }\ngain = 3.0'
+
+
+@pytest.mark.parametrize(("parameters", "notes"), [(TWINS["ode"][4], 1), (CURVE, 0)])
+def test_a_clock_in_hours_raises_no_doubt_of_its_unit(tmp_path: Path, parameters: str, notes: int) -> None:
+    """The samples may still be too far apart for the twin, which a curve has no opinion on."""
+    k = np.arange(600)
+    np.savez(tmp_path / "data.npz", t_h=0.01 * k, u=np.sin(0.03 * k), y=np.cos(0.03 * k))
+    (tmp_path / "recording.toml").write_text(
+        f'format = 1\ndata = "data.npz"\ntime_column = "t_h"\n[twin]\nkind = "ode"\n[twin.parameters]\n{parameters}\n'
+        '[[channels]]\ncolumn = "u"\nrole = "input"\nsignal = "u"\nunit = "V"\n'
+        '[[channels]]\ncolumn = "y"\nrole = "output"\nsignal = "y"\nunit = "V"\n'
+    )
+    found = [note for note in load(tmp_path).warnings if "samples are 36 s apart" in note]
+    assert len(found) == notes
+    assert all(note.endswith("check the units of the twin's time constants") for note in found)
+
+
 @pytest.mark.parametrize(("name", "unit_s"), [("t_s", 1.0), ("t_h", 3600.0)])
 def test_new_takes_the_stamps_that_simulate_takes(tmp_path: Path, name: str, unit_s: float) -> None:
     """Short gaps are filled in either unit, long ones are refused by both."""

@@ -27,6 +27,7 @@ from tools.mismatch.twins.make import make
 from tools.numbers import rms
 
 KINDS = (".toml", ".py", ".fmu")
+CHECK = "check units, signs and offsets (where a plant integrates, small errors add up)"
 LEAST_OFFSET = 0.9
 """Ratio of the scatter to the rms of a residual below which its mean is printed as well."""
 
@@ -59,7 +60,7 @@ class Residual:
         if self.share is None:
             return line
         line += f", {percent(self.share)} of the recording's standard deviation"
-        return line if self.share <= 1.0 else f"{line}: its mean alone would be closer; check units, signs and offsets"
+        return line if self.share <= 1.0 else f"{line}: its mean alone would be closer; {CHECK}"
 
 
 def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
@@ -85,7 +86,9 @@ def as_read(recording: Recording) -> list[str]:
     holds = declared_holds(recording)
     has_hold = "hold" in names(PARAMETERS.get(recording.twin.kind, ()))
     named = lambda of: ", ".join(f"{s} ({recording.file_unit[s]})" for s in of)  # noqa: E731
-    hold = {s: f", hold {holds.get(s, 'not given')}" if has_hold or s in holds else "" for s in recording.inputs}
+    hold = {
+        s: f", hold {holds.get(s, 'not given, straight')}" if has_hold or s in holds else "" for s in recording.inputs
+    }
     held = ", ".join(f"{s} ({recording.file_unit[s]}{hold[s]})" for s in recording.inputs)
     runs = f" in {len(recording.segments) + 1} runs" if recording.segments else ""
     lines = [

@@ -79,11 +79,7 @@ class Search:
 
     def run(self) -> Found:
         """Extend until nothing can gain, then swap; refine the sets between which the decision is made."""
-        self.expand(self.store.base)
-        self.combine()
-        self.store.listen(self.store.ranked()[0])
-        self.pair()
-        self.grow()
+        self.extend()
         self.moves = max(self.moves, 1)  # for an account without the first name of the best one
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
@@ -109,6 +105,14 @@ class Search:
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
+
+    def extend(self) -> None:
+        """Extend the base, and the best sets while they can gain and ``moves`` last."""
+        self.expand(self.store.base)
+        self.combine()
+        self.store.listen(self.store.ranked()[0])
+        self.pair()
+        self.grow()
 
     def pruned(self) -> Scored:
         """Drop names of the best set while the score grows, and return the best one.
@@ -322,7 +326,7 @@ def search(
 
 
 NOMINATED = 8
-"""Number of sets of a search on a part of a recording, best first, whose names are tried on the whole."""
+"""Number of sets of a search, best first, whose names another one tries: of the whole, or with other holds."""
 
 
 def look(
@@ -330,16 +334,30 @@ def look(
 ) -> tuple[set[str], list[Hint]]:
     """Return the names in the best sets of a short search on a part of a recording, with their fits as hints.
 
-    ``nominated`` calls it. Events are tried on the whole in any case, because a part may have none.
+    ``nominated`` calls it.
     """
     with np.errstate(all="ignore"):
-        store = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2).run().store
-    best = [s for s in store.ranked() if s.names][:NOMINATED]
-    names = {n for s in best for n in s.names} | {e.name for e in allowed if e.claims is not None}
+        short = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2)
+        short.extend()  # which of the names is the right one is asked on the whole
+    store = short.store
     hints = {
         part_of(p): hint_of(p, s.fitted)
-        for s in reversed(best)
+        for s in reversed(best_sets(store))
         for p in s.placed
         if part_of(p) in store.seen and may_hint(p, store.seen[part_of(p)])
     }
-    return names, list(hints.values())
+    return {e.name for e in nominees(store, allowed)}, list(hints.values())
+
+
+def best_sets(store: Store) -> list[Scored]:
+    """Return the sets whose names another search tries."""
+    return [s for s in store.ranked() if s.names][:NOMINATED]
+
+
+def nominees(store: Store, allowed: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return those of ``allowed`` that another search of the same physics has to try.
+
+    Events are among them in any case, because the searched part may have none.
+    """
+    names = {n for s in best_sets(store) for n in s.names}
+    return tuple(e for e in allowed if e.name in names or e.claims is not None)

@@ -79,16 +79,16 @@ micron mismatch simulate twin.py . --out simulated.csv
 ``` { .toml title="recording.toml" }
 {written}```
 
-The command reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
+The command reads text tables (any delimiter, decimal comma, header or none, a row of units),
 {endings}.
-It prints what it could not know and writes it into the file as a comment. `--twin KIND` names the twin. A column `t`
-without a unit is read as seconds; give `--rate HZ` if that is wrong, or if no column is a time. `t_ms`, `t_min` and
-`t_h` are read as they say.
+What it could not know it writes into the file as a comment. A column `t`
+without a unit is read as seconds; `--rate HZ` corrects it, or stands for a missing one. `t_ms`, `t_min`,
+`t_h` and dates (`2026-03-10 18:00:00`) are read as they say.
 
-Where time steps are uneven or values are missing, the command names the line and writes nothing. Repeat it with
-`--cut`: it resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
-`recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the samples at which they
-begin, and one diagnosis covers all.
+Where time steps are uneven or values are missing, the command names the line and writes nothing;
+`--cut` resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
+`recording.npz` then holds the runs one after another, `segments` in `recording.toml` names the samples at which the
+later ones begin, as it does of runs that you stack, and one diagnosis covers all.
 
 {samples}
 
@@ -284,8 +284,8 @@ def _samples() -> str:
     """Return how long a recording should be, with the limits that the loader and the engine have."""
     return (
         f"{MIN_SAMPLES} samples are needed, and some thousands are sensible. From {round(LEAST / SHARE)} on the last"
-        f" tenth is scored once; above {LONG} the search works on reduced copies. Record the temperature as a context"
-        " channel, else no effect of it is found."
+        f" tenth is scored once; from {LONG} on the search begins on reduced copies. Record the temperature as a"
+        " context channel, else no effect of it is found."
     )
 
 
