@@ -217,7 +217,7 @@ def test_an_output_without_a_simulated_course_is_asked_for(tmp_path: Path):
 def test_a_twin_that_nothing_tells_is_asked_for_with_the_two_of_ones_own(tmp_path: Path):
     t = np.arange(300.0)
     found = guess(table(tmp_path, "t_s,pump [l/min],level [mm]", t, np.sin(t), np.cos(t)))
-    assert "--twin ode (your equations as text), --twin columns" in found.unknown[0]
+    assert "--twin ode (your equations as text, or a curve without states), --twin columns" in found.unknown[0]
 
 
 def test_a_twin_that_units_alone_suggest_is_an_assumption(tmp_path: Path):

@@ -418,7 +418,7 @@ def simulate(
         check_picture(image)
         decide_on([twin, recording or twin], trust, allow_outside)
         from tools.mismatch.export.picture import save_run
-        from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own
+        from tools.mismatch.export.run import Residual, as_read, residuals, simulate_file, simulate_own, start_of
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import columns_left_out, load
         from tools.mismatch.simulate_bounds import run_bounded
@@ -429,8 +429,9 @@ def simulate(
             return simulate_own(loaded) if recording is None else simulate_file(twin, loaded)
 
         simulated = run_bounded(twin, loaded, run)  # a fault of the twin is told alone
-        for line in as_read(loaded):
-            _print_read(line)
+        for line in [*as_read(loaded), start_of(loaded) if recording is None else ""]:
+            if line:
+                _print_read(line)
         left_out = columns_left_out(recording or twin)
         if left_out:
             more = f" and {len(left_out) - MOST_NAMED} more" if len(left_out) > MOST_NAMED else ""

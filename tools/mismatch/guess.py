@@ -410,8 +410,9 @@ def _no_kind(kinds: Sequence[str], left: Sequence[str], parts: Parts, found: Ass
     }
     return (
         f"the twin: no kind is told by {', '.join(by_role['input'])} in and {', '.join(by_role['output'])} out;"
-        " set its kind, or repeat with --twin ode (your equations as text), --twin columns (the file holds simulated"
-        f" columns, too) or another KIND ({', '.join(k for k in KINDS if k not in ('ode', 'columns'))})"
+        " set its kind, or repeat with --twin ode (your equations as text, or a curve without states), --twin columns"
+        " (the file holds simulated columns, too) or another KIND"
+        f" ({', '.join(k for k in KINDS if k not in ('ode', 'columns'))})"
     )
 
 

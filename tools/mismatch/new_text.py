@@ -68,7 +68,7 @@ def _equations(found: Guess) -> Iterator[str]:
     yield f"# {answer.signal} = {json.dumps(answer.unit, ensure_ascii=False)}"
     yield "[twin.equations] # the derivative of each state"
     yield f'# {answer.signal} = "(gain * {drive.signal} - {answer.signal}) / time_constant" # an example'
-    yield "[twin.outputs] # outputs that are no state"
+    yield "[twin.outputs] # outputs that are no state; alone, without states and equations, they are a curve"
     yield "[twin.units] # units of parameters; of an input or output where the equations want another than the column's"
 
 

@@ -166,3 +166,15 @@ def test_a_first_segment_at_zero_is_told_to_be_left_out(tmp_path: Path) -> None:
     text = SLIDING.replace("[twin]", "segments = [0, 100]\n[twin]", 1)
     with pytest.raises(RecordingError, match="the first run begins at 0 in any case; leave the 0 out"):
         load(_recorded(tmp_path, text, 0.0))
+
+
+def test_the_states_at_the_first_sample_are_printed(tmp_path: Path) -> None:
+    """They are found from the record: a decay from 1 mm without a drive."""
+    text = SLIDING.replace('"mechanical_axis"', '"ode"\nstates = { position = "mm" }\nrate = 0.2')
+    text = text.replace("mass = 1.0", 'equations = { position = "force - rate * position" }')
+    (tmp_path / "recording.toml").write_text(text)
+    t = np.arange(200) / 10.0
+    np.savetxt(tmp_path / "data.csv", np.c_[np.exp(-0.2 * t), 0 * t], delimiter=",", header="x,sim", comments="")
+    ran = CliRunner().invoke(app, ["mismatch", "simulate", str(tmp_path)])
+    assert ran.exit_code == 0, ran.output
+    assert "states at the first sample: position = 1 mm" in ran.stderr

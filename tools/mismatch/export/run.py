@@ -20,10 +20,13 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load, load_twin
 from tools.mismatch.report.wording import percent
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_view import View
+from tools.mismatch.simulate_view import View, view_run
+from tools.mismatch.twins.base import Signal
 from tools.mismatch.twins.fmu import FmuRun, with_equations
 from tools.mismatch.twins.holds import declared_holds
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.vocabulary import NO_STATE
 from tools.numbers import rms
 
 KINDS = (".toml", ".py", ".fmu")
@@ -105,6 +108,20 @@ def as_read(recording: Recording) -> list[str]:
     if given:
         lines.append("parameters: " + ", ".join(f"{k} = {v:.6g}" for k, v in given.items()))
     return [*lines, *linear_lines(recording), *(f"note: {note}" for note in recording.warnings)]
+
+
+def start_of(recording: Recording) -> str:
+    """Return the states of a twin with equations at the first sample, as a line; empty for other twins."""
+    recording = with_equations(recording)
+    twin = make(recording)
+    if not isinstance(twin, OdeTwin) or [x.name for x in twin.state_list] == [NO_STATE]:
+        return ""
+    run = view_run(twin, whole_view(recording, Model(twin)))
+    inputs = {s: Signal(run.signals[s], {}, (s,)) for s in recording.inputs}
+    x = twin.states(run, inputs, twin.start(recording), ())[0][0]
+    return "states at the first sample: " + ", ".join(
+        f"{s.name} = {v:.4g} {s.unit}".rstrip() for s, v in zip(twin.state_list, x.tolist(), strict=True)
+    )
 
 
 def simulate_own(recording: Recording) -> dict[str, Array]:
