@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.hysteresis import stops
+from sim_devices.physics.memory import stops
 from sim_devices.physics.statistics import best_starts, thin
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import FRICTION, OFFSET, base_moves, loop_along, packed
-from sim_devices.physics.hysteresis import dahl
+from sim_devices.physics.memory import dahl
 from sim_devices.physics.statistics import Start, best_starts, smooth, thin
 
 

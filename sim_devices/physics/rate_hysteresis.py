@@ -11,14 +11,12 @@ from sim_devices.physics.hysteresis import (
     CYCLE,
     MASING,
     choose,
-    dahl,
     loop_width,
-    stops,
     test_cycle,
-    thresholds,
     way_before,
 )  # fmt: skip
 from sim_devices.physics.lag import low_pass
+from sim_devices.physics.memory import dahl, stops, thresholds
 from sim_devices.physics.statistics import smooth
 
 N_PLAYS = 6

@@ -9,7 +9,7 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.forces import COGGING, FRICTION, OFFSET, SPRING, friction_limit, loop_along
-from sim_devices.physics.hysteresis import dahl
+from sim_devices.physics.memory import dahl
 from tools.mismatch.twins.feedback import Body, Rows, run_feedback
 
 NO_SPRING, NONE5, NONE6 = np.zeros(SPRING), np.zeros(COGGING), np.zeros(FRICTION)

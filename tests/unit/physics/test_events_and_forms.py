@@ -12,7 +12,8 @@ from sim_devices.physics import hysteresis
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.dropped_samples import find_drops
 from sim_devices.physics.effect import Context
-from sim_devices.physics.hysteresis import loop_width, stops
+from sim_devices.physics.hysteresis import loop_width
+from sim_devices.physics.memory import stops
 from sim_devices.physics.slew import SUBSTEPS, slew
 from sim_devices.physics.step_shift import paying_steps
 

@@ -11,7 +11,7 @@ import pytest
 from hal.arrays import Array
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
-from sim_devices.physics.hysteresis import dahl, relays, risen, stops
+from sim_devices.physics.memory import dahl, relays, risen, stops
 
 ONE = np.zeros(1, np.int64)
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array, Context
-from sim_devices.physics.hysteresis import stops
+from sim_devices.physics.memory import stops
 from sim_devices.physics.statistics import bounded_solution, long_run_rms, signed_least_squares
 from sim_devices.physics.step_shift import edges, find_steps
 
