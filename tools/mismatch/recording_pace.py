@@ -15,7 +15,6 @@ from hal.trust import NotTrusted
 from tools.errors import RecordingError
 from tools.mismatch.guess_roles import split_clock
 from tools.mismatch.recording import Array, Recording
-from tools.mismatch.twins.vocabulary import NO_STATE
 
 FAR_APART = 2.0
 """Distance of two samples, in slowest time constants of the twin, from which on the time column is doubted."""
@@ -55,9 +54,7 @@ def _rates_per_s(recording: Recording) -> Array:
                 twin = ode_twin(recording)
             except (RecordingError, NotTrusted):  # a later step reports the fault
                 return np.zeros(0)
-            if [x.name for x in twin.state_list] == [NO_STATE]:
-                return np.zeros(0)
-            return _moduli(twin.linearised(twin.start_values).a)
+            return _moduli(twin.linearised(twin.start_values).a) if twin.has_states else np.zeros(0)
         case _:
             return np.zeros(0)
 

@@ -26,7 +26,6 @@ from tools.mismatch.twins.fmu import FmuRun, with_equations
 from tools.mismatch.twins.holds import declared_holds
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.ode import OdeTwin
-from tools.mismatch.twins.vocabulary import NO_STATE
 from tools.numbers import rms
 
 KINDS = (".toml", ".py", ".fmu")
@@ -114,7 +113,7 @@ def start_of(recording: Recording) -> str:
     """Return the states of a twin with equations at the first sample, as a line; empty for other twins."""
     recording = with_equations(recording)
     twin = make(recording)
-    if not isinstance(twin, OdeTwin) or [x.name for x in twin.state_list] == [NO_STATE]:
+    if not isinstance(twin, OdeTwin) or not twin.has_states:
         return ""
     run = view_run(twin, whole_view(recording, Model(twin)))
     inputs = {s: Signal(run.signals[s], {}, (s,)) for s in recording.inputs}

@@ -258,9 +258,14 @@ class OdeTwin(Head):
         return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
 
     @cached_property
+    def has_states(self) -> bool:
+        """Return False for a curve."""
+        return [x.name for x in self.state_list] != [NO_STATE]
+
+    @cached_property
     def sums_inputs(self) -> bool:
         """Return True if no state moves and the outputs are affine in the signals."""
-        return self.reads_affine and [x.name for x in self.state_list] == [NO_STATE]
+        return self.reads_affine and not self.has_states
 
     def _gains(self, theta: Array) -> Array:
         """Return the gains (q, m) from the signals to outputs that are their sums."""
@@ -315,6 +320,8 @@ class OdeTwin(Head):
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """Return states (n, s) of a free run from start states that the measured samples of each stretch set."""
+        if not self.has_states:
+            return np.zeros((run.t.size, 1))
         values = self.values(theta)
         inside = self.packed(forces, values)
         sub, fine = self.substeps(run.dt, inside)
