@@ -5,6 +5,7 @@ Recordings are integrated here, with sensors of their own: behind a low-pass, sm
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
+from tests.unit.mismatch_report.canned import creep
+from tools.mismatch.engine.assemble import summary
 from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.noise import NoiseFloor, floor_interval, noise_floor, repeat_floor, rest_floor, without_lines
 from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.unexplained import Leftover
-from tools.mismatch.engine.verdict import fit_trouble, meaning_of
+from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of
 from tools.mismatch.engine.windows import bad_windows
 from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording
@@ -188,6 +191,21 @@ def test_a_fit_that_is_worse_than_the_belief_is_called_a_failed_fit() -> None:
     assert "worse" in fit_trouble(problem, raw, spoiled, spoiled)[0]
     away = replace(base, residual={o: r + 1e6 for o, r in base.residual.items()})
     assert "runs away" in fit_trouble(problem, raw, away, away)[0]
+
+
+def test_an_unexplained_rest_does_not_hide_what_a_name_explains() -> None:
+    rng = np.random.default_rng(11)
+    problem, _, base = prepared(stack(rng, 50 + 40 * wave(rng, N)), 0.3, 0, False)
+    fitted = replace(base, residual={o: 0.25 * r for o, r in base.residual.items()})
+    decision = Decision("unexplained", 1e-9, "unknown", (), {"displacement": (0.001, 0.001)})
+    told = [summary(decision, names, ["displacement"], [], problem, (base, fitted)) for names in ([], [creep()])]
+    assert told[0] == "Something is left in displacement that no known effect explains."
+    found = re.fullmatch(
+        re.escape(told[0]) + r" With creep the held-out residual falls from (\S+) to (\S+) \w+\.", told[1]
+    )
+    assert found is not None, told[1]
+    before, after = found.groups()
+    assert float(after) == pytest.approx(0.25 * float(before), rel=0.01)
 
 
 def test_windows_are_spans_even_where_all_of_the_record_is_above_the_noise() -> None:

@@ -293,30 +293,43 @@ def summary(
     if verdict == "recalibrate":
         return "New base parameters explain the recording; no physics is missing." + if_noise(decision, problem, b)
     if verdict == "missing_physics":
-        names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
-        factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o], problem.recording.file_unit[o])
         text = (
-            f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
-            f" from {number(factor * a[o])} to {number(factor * b[o])} {unit}."
+            f"The simulation lacks {_names_of(physics)} at the {physics[0].stage} ({outputs}): with it the held-out"
+            f" residual {_fall(problem, o, a, b)}."
         )
         times = b[o] / max(decision.floors[o][1], 1e-300)
         if times > MUCH_LEFT and b[o] > problem.recording.tolerance.get(o, 0.0):
             text += f" That is still {number(times)} times the noise: it is not the whole account."
         return text
     if decision.meaning == "place_not_reachable" and physics and all(imitable(physics, problem.twin)):
-        names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         least = ", down to the noise," if all(b[o] <= MUCH_LEFT * decision.floors[o][1] for o in guilty) else ""
         return (
-            f"What {names} explains of {outputs}{least} may also be a wrong parameter of the simulation that made the"
-            " columns."
+            f"What {_names_of(physics)} explains of {outputs}{least} may also be a wrong parameter of the simulation"
+            " that made the columns."
         )
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
+    part = (
+        f" With {_names_of(physics)} the held-out residual {_fall(problem, physics[0].output, a, b)}."
+        if physics
+        else ""
+    )
     if decision.meaning == "floor_doubtful":
-        return f"Something may be left in {outputs}{what}; whether it is noise this recording does not say."
+        return f"Something may be left in {outputs}{what}; whether it is noise this recording does not say.{part}"
     if decision.meaning == "fit_failed":
-        return f"Something is left in {outputs}{what}, but the fit failed: {decision.trouble[0]}."
-    return f"Something is left in {outputs} that no known effect explains{what}."
+        return f"Something is left in {outputs}{what}, but the fit failed: {decision.trouble[0]}.{part}"
+    return f"Something is left in {outputs} that no known effect explains{what}.{part}"
+
+
+def _names_of(physics: Sequence[PhysicsFound]) -> str:
+    return " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
+
+
+def _fall(problem: Problem, output: str, before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    """Return from what and to what the held-out residual of an output falls, with its unit."""
+    largest = max(before[output], after[output])
+    factor, unit = scaled(largest, problem.twin.units[output], problem.recording.file_unit[output])
+    return f"falls from {number(factor * before[output])} to {number(factor * after[output])} {unit}"
 
 
 def if_noise(decision: Decision, problem: Problem, left: Mapping[str, float]) -> str:
