@@ -21,6 +21,7 @@ from tools.mismatch.twins import equations
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.memo import Start
 from tools.mismatch.twins.ode_run import run_equations
+from tools.mismatch.twins.ode_start import start_step
 
 
 def test_a_start_that_nobody_knows_is_set_by_the_first_samples(tmp_path: Path) -> None:
@@ -224,3 +225,17 @@ def test_a_search_goes_on_from_the_starts_of_an_earlier_place_while_these_suit(
         assert np.mean(found**2) < 1.01 * np.mean(alone**2)
     else:
         assert np.array_equal(found, alone)
+
+
+def test_the_step_of_every_stretch_is_that_of_least_squares() -> None:
+    """And the squares that it foretells are those which are left. The second state of one stretch is not seen."""
+    rng = np.random.default_rng(3)
+    slopes, missed = rng.standard_normal((30, 2, 3)), rng.standard_normal((30, 2))
+    slopes[12:20, :, 1] = 0.0
+    edges = [(0, 12), (12, 20), (20, 30)]
+    turn, left = start_step(slopes, missed, edges)
+    for k, (a, b) in enumerate(edges):
+        c, y = slopes[a:b].reshape(-1, 3), missed[a:b].reshape(-1)
+        step = np.linalg.lstsq(c, y)[0]
+        np.testing.assert_allclose(turn[k], step, atol=1e-13)
+        assert left[k] == pytest.approx(float(np.sum((y - c @ step) ** 2)), rel=1e-12)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from tools.mismatch.twins.base import Run
 from tools.mismatch.twins.memo import Start
@@ -39,21 +40,46 @@ def edges_of(rows: NDArray[np.int64], stretches: int) -> Edges:
     return list(zip(first, [*first[1:], rows.size], strict=True))
 
 
+@kernel
+def normal_sums(slopes, missed, first):
+    """Return the sums of squares and products of slopes (rows, q, s) and misses (rows, q) from each ``first`` row to
+    the next: (k, s, s), (k, s) and (k,)."""
+    rows, q, s = slopes.shape
+    gram = np.zeros((first.size, s, s))
+    cross = np.zeros((first.size, s))
+    squares = np.zeros(first.size)
+    for k in range(first.size):
+        stop = first[k + 1] if k + 1 < first.size else rows
+        for r in range(first[k], stop):
+            for o in range(q):
+                e = missed[r, o]
+                squares[k] += e * e
+                for i in range(s):
+                    v = slopes[r, o, i]
+                    cross[k, i] += v * e
+                    for j in range(i + 1):
+                        gram[k, i, j] += v * slopes[r, o, j]
+        for i in range(s):
+            for j in range(i):
+                gram[k, j, i] = gram[k, i, j]
+    return gram, cross, squares
+
+
 def start_step(slopes: Array, missed: Array, edges: Edges) -> tuple[Array, Array]:
     """Return the Gauss-Newton step (stretches, s) of start states and the squares (stretches,) that it should leave.
 
     ``slopes`` (rows, q, s) of the negative of ``missed`` (rows, q). What the samples do not determine is not moved.
     """
-    s = slopes.shape[2]
-    columns = [(slopes[a:b].reshape(-1, s), missed[a:b].reshape(-1)) for a, b in edges]
-    gram = np.stack([c.T @ c for c, _ in columns])
-    cross = np.stack([c.T @ y for c, y in columns])
+    gram, cross, squares = normal_sums(
+        np.ascontiguousarray(slopes), np.ascontiguousarray(missed), np.array([a for a, _ in edges], np.int64)
+    )
     whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
     size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
     determined = size > LEAST_SHOWN**2 * size[:, -1:]
     along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
     turn = np.einsum("kij,kj->ki", ways, np.where(determined, along / np.where(determined, size, 1.0), 0.0))
-    return turn, np.array([np.sum((y - c @ step) ** 2) for (c, y), step in zip(columns, turn, strict=True)])
+    left = squares - 2.0 * np.einsum("ki,ki->k", turn, cross) + np.einsum("ki,kij,kj->k", turn, gram, turn)
+    return turn, np.maximum(left, 0.0)
 
 
 def slopes_of(x0: Array, missed: Array, misses: Callable[[Array], Array], typical: Array) -> Array:
