@@ -50,7 +50,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-false-alarms": (),
     "mismatch-foreign": (),
     "mismatch-measured": (),
-    "mismatch-found": (),
+    "mismatch-found": ("A second set",),
     "mismatch-gate": ("First run", "Sure learned", "Start states", "A draw after measured"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
