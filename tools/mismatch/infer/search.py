@@ -79,7 +79,11 @@ class Search:
 
     def run(self) -> Found:
         """Extend until nothing can gain, then swap; refine the sets between which the decision is made."""
-        self.extend()
+        self.expand(self.store.base)
+        self.combine()
+        self.store.listen(self.store.ranked()[0])
+        self.pair()
+        self.grow()
         self.moves = max(self.moves, 1)  # for an account without the first name of the best one
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
@@ -105,14 +109,6 @@ class Search:
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
-
-    def extend(self) -> None:
-        """Extend the base, and the best sets while they can gain and ``moves`` last."""
-        self.expand(self.store.base)
-        self.combine()
-        self.store.listen(self.store.ranked()[0])
-        self.pair()
-        self.grow()
 
     def pruned(self) -> Scored:
         """Drop names of the best set while the score grows, and return the best one.
@@ -337,9 +333,7 @@ def look(
     ``nominated`` calls it.
     """
     with np.errstate(all="ignore"):
-        short = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2)
-        short.extend()  # which of the names is the right one is asked on the whole
-    store = short.store
+        store = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2).run().store
     hints = {
         part_of(p): hint_of(p, s.fitted)
         for s in reversed(best_sets(store))

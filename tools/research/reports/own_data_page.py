@@ -284,7 +284,7 @@ def _samples() -> str:
     """Return how long a recording should be, with the limits that the loader and the engine have."""
     return (
         f"{MIN_SAMPLES} samples are needed, and some thousands are sensible. From {round(LEAST / SHARE)} on the last"
-        f" tenth is scored once; from {LONG} on the search begins on reduced copies. Record the temperature as a"
+        f" tenth is scored once; above {LONG} the search begins on reduced copies. Record the temperature as a"
         " context channel, else no effect of it is found."
     )
 
