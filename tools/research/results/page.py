@@ -51,7 +51,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-foreign": (),
     "mismatch-measured": (),
     "mismatch-found": ("A second set",),
-    "mismatch-gate": ("First run", "Sure learned", "Start states", "A draw after measured"),
+    "mismatch-gate": ("First run", "Sure learned", "Start states", "A draw with constants"),
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
     "together": ("Not named",),
