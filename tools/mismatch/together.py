@@ -14,8 +14,11 @@ from tools.mismatch.batch import find, is_folder_of_recordings
 from tools.mismatch.recording import Part, Recording, Split
 from tools.mismatch.recording_load import load
 from tools.mismatch.recording_ranges import APART
+from tools.mismatch.twins.make import make
 
 CLOSE_RATE = 1e-6
+START = "x0"
+"""The parameter of a twin that is the state of the first sample."""
 
 
 def recordings_of(paths: Sequence[Path]) -> dict[str, Path]:
@@ -101,8 +104,23 @@ def _check_alike(first: Recording, other: Recording) -> None:
             f"{both}: one has {1 / first.dt:g} samples per second, the other {1 / other.dt:g};"
             " 'micron mismatch new DATA --resample HZ' brings one to the rate of the other"
         )
-    if _plain(first.twin.parameters) != _plain(other.twin.parameters) or first.twin.effects != other.twin.effects:
+    if not _is_one_twin(first, other):
         raise RecordingError(f"{both}: their [twin] tables differ; one twin holds for all, so give one file to both")
+
+
+def _is_one_twin(first: Recording, other: Recording) -> bool:
+    """Return True if the twins of two recordings differ at most in the state of the first sample.
+
+    That state belongs to a recording. The value of a constant state is a parameter of the twin and has to be the same.
+    """
+    if first.twin.effects != other.twin.effects:
+        return False
+    a, b = (dict(r.twin.parameters) for r in (first, other))
+    if _plain(a) == _plain(b):
+        return True
+    if _plain({**a, START: None}) != _plain({**b, START: None}):
+        return False
+    return np.array_equal(*(make(r).start(r) for r in (first, other)))
 
 
 def _plain(parameters: object) -> str:

@@ -118,6 +118,29 @@ def test_recordings_that_do_not_fit_together(tmp_path: Path, old: str, new: str,
     assert "b/recording.toml" in output.replace(" ", "")
 
 
+def tank(folder: Path, x0: list[float]) -> Path:
+    """A first-order plant with an offset that is written as a constant state."""
+    folder.mkdir()
+    u = np.sin(np.arange(200) / 9.0)
+    np.savez(folder / "data.npz", u_V=u, y_V=np.convolve(u, np.exp(-np.arange(50)))[:200])
+    parameters = f"A = [[-1.0, 1.0], [0.0, 0.0]]\nB = [[1.0], [0.0]]\nC = [[1.0, 0.0]]\nD = [[0.0]]\nx0 = {x0}\n"
+    channels = "".join(
+        f'[[channels]]\ncolumn = "{c}"\nrole = "{role}"\nsignal = "{s}"\nunit = "V"\n'
+        for c, role, s in (("u_V", "input", "drive"), ("y_V", "output", "level"))
+    )
+    text = (
+        f'format = 1\ndata = "data.npz"\nrate_hz = 10.0\n[twin]\nkind = "state_space"\n[twin.parameters]\n{parameters}'
+    )
+    (folder / "recording.toml").write_text(text + channels)
+    return folder
+
+
+def test_a_start_state_belongs_to_a_recording_and_a_constant_state_to_the_twin(tmp_path: Path) -> None:
+    one, other = tank(tmp_path / "one", [0.0, 2.0]), tank(tmp_path / "other", [1.5, 2.0])
+    assert len(load_together([one, other]).parts) == 2
+    assert "[twin] tables differ" in refused("--together", one, tank(tmp_path / "offset", [0.0, 2.5]))
+
+
 def test_one_message_for_each_wrong_command(tmp_path: Path) -> None:
     a, b = write(tmp_path / "a", 0, n=100), write(tmp_path / "b", 1, n=100)
     (tmp_path / "empty").mkdir()
