@@ -128,10 +128,8 @@ def tank(folder: Path, x0: list[float]) -> Path:
         f'[[channels]]\ncolumn = "{c}"\nrole = "{role}"\nsignal = "{s}"\nunit = "V"\n'
         for c, role, s in (("u_V", "input", "drive"), ("y_V", "output", "level"))
     )
-    text = (
-        f'format = 1\ndata = "data.npz"\nrate_hz = 10.0\n[twin]\nkind = "state_space"\n[twin.parameters]\n{parameters}'
-    )
-    (folder / "recording.toml").write_text(text + channels)
+    head = 'format = 1\ndata = "data.npz"\nrate_hz = 10.0\n[twin]\nkind = "state_space"\n[twin.parameters]\n'
+    (folder / "recording.toml").write_text(head + parameters + channels)
     return folder
 
 
