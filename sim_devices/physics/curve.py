@@ -146,6 +146,6 @@ _FOLD = replace(
     apply=_fold_apply,
     report=reports(("power", "1"), ("zero", "{out}")),
     sites=("output",),
-    vanishes_with=(("power",),),
+    plain_without=(("power",),),
 )
 STATIC_NONLINEARITY = replace(_CURVE, variants=(_FOLD,))

@@ -100,6 +100,8 @@ ONE_SIDED_CONDUCTION = Effect(
     sites=("input", "output", "between"),
     # elsewhere it would stand in for saturation, and neither would be named
     end_units=("V", "mV", "kV"),
-    vanishes_with=(("exponential_width",),),
+    # with a sharp knee it is a limit
+    plain_without=(("exponential_width",),),
+    plain="saturation",
     essential=("knee",),
 )

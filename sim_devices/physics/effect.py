@@ -289,9 +289,11 @@ class Effect:
     )
     """Ranges of human parameters that belong to another effect by definition."""
     vanishes_with: tuple[tuple[str, ...], ...] = ()
-    """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect is absent when every
+    """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect adds nothing when every
     parameter of any one group is zero, so it is named only where the data exclude that. Empty: one group of all.
     """
+    plain_without: tuple[tuple[str, ...], ...] = ()
+    """Groups like those of ``vanishes_with``, without any one of which the effect is another, plainer one."""
     plain_in: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     """Ranges of human parameters in which the effect is no more than a plainer one (a slew limit that is never met is a
     lag). It is not named while the 95 % interval of one reaches into its range."""

@@ -243,7 +243,8 @@ _COULOMB = Effect(
     basis=_coulomb_basis,
     fill=_coulomb_fill,
     report=_coulomb_report,
-    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
+    # against one direction alone it is another force
+    plain_without=(("coulomb_forward",), ("coulomb_backward",)),
 )
 _BRISTLES = replace(
     _COULOMB,
@@ -414,7 +415,7 @@ _SQUARED = Effect(
     fill=_stribeck_fill,
     report=_stribeck_report,
     # without a rise it is Coulomb's
-    vanishes_with=(("rise_at_rest",),),
+    plain_without=(("rise_at_rest",),),
     plain="coulomb_friction",
     # a fall that is wider than all speeds that occur is viscous, and one that is narrower is not seen
     essential=("stribeck_speed",),

@@ -122,7 +122,8 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     report=_report,
     # a loop that is as wide at rest as at speed is rate-independent memory; that of a lag closes at rest
     limits={"change_with_speed": (0.08, 0.95)},
-    vanishes_with=(("loop_width_share_slow",), ("change_with_speed",)),
+    vanishes_with=(("loop_width_share_slow",),),
+    plain_without=(("change_with_speed",),),
     plain="hysteresis",
     laws=2,  # a loop and a lag
 )

@@ -127,11 +127,11 @@ def test_which_groups_of_parameters_may_be_zero() -> None:
         return ParameterValue(v, "1", (v - half, v + half))
 
     play, share = EFFECTS["backlash"], value(1.0, 0.1)
-    assert absent_groups(play, {"gap": value(7e-5, 3.6e-4), "slope_lost_inside": share}) == [("gap",)]
-    assert absent_groups(play, {"gap": value(1.0, 0.1), "slope_lost_inside": share}) == []
+    assert absent_groups(play.vanishes_with, {"gap": value(7e-5, 3.6e-4), "slope_lost_inside": share}) == [("gap",)]
+    assert absent_groups(play.vanishes_with, {"gap": value(1.0, 0.1), "slope_lost_inside": share}) == []
     # any amplitude of a line will do
     lines = EFFECTS["vibration"]
-    assert absent_groups(lines, {"amplitude_1": value(1.0, 0.1), "amplitude_2": value(0.0, 0.1)}) == []
+    assert absent_groups(lines.vanishes_with, {"amplitude_1": value(1.0, 0.1), "amplitude_2": value(0.0, 0.1)}) == []
     # an interval that nobody could work out excludes nothing
     assert holds_zero(ParameterValue(1.0, "1", (float("nan"), float("nan"))))
     assert not holds_zero(ParameterValue(4.0, "1", (4.0, 4.0)))
@@ -145,8 +145,8 @@ def test_of_several_sizes_one_may_be_away_from_zero_by_chance() -> None:
     assert not holds_zero(clear, 3)
     spring = EFFECTS["cubic_stiffness"]
     nothing = ParameterValue(0.0, "1", (-1.0, 1.0))
-    assert absent_groups(spring, {"cubic_stiffness": nothing, "quadratic_stiffness": barely})
-    assert not absent_groups(spring, {"cubic_stiffness": nothing, "quadratic_stiffness": clear})
+    assert absent_groups(spring.vanishes_with, {"cubic_stiffness": nothing, "quadratic_stiffness": barely})
+    assert not absent_groups(spring.vanishes_with, {"cubic_stiffness": nothing, "quadratic_stiffness": clear})
 
 
 def test_a_loop_whose_change_with_speed_may_be_zero_is_a_plain_loop() -> None:

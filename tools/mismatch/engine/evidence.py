@@ -7,14 +7,13 @@ named, with the reason.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import numpy as np
 from scipy.stats import norm
 
-from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.report import ParameterValue, WithheldReason
@@ -48,10 +47,10 @@ def reaches(p: ParameterValue, span: tuple[float, float]) -> bool:
     return not (np.isfinite(lo) and np.isfinite(hi)) or (lo <= span[1] and hi >= span[0])
 
 
-def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> list[tuple[str, ...]]:
-    """Return the groups of ``effect.vanishes_with`` of which all parameters may be zero, as the parameters' names."""
+def absent_groups(groups: Sequence[Sequence[str]], parameters: Mapping[str, ParameterValue]) -> list[tuple[str, ...]]:
+    """Return the ``groups`` (patterns) of which all parameters may be zero, as the parameters' names."""
     out: list[tuple[str, ...]] = []
-    for patterns in effect.vanishes_with or (("*",),):
+    for patterns in groups:
         names = tuple(n for n in parameters if any(fnmatchcase(n, q) for q in patterns))
         if names and all(holds_zero(parameters[n], len(names)) for n in names):
             out.append(names)
@@ -61,20 +60,31 @@ def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> l
 def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsure: Uncertainty) -> Doubt | None:
     """Return why effect ``k`` of a model may not be named; None if it may.
 
-    An effect that several weights show, and no searched parameter, is significant if they are not jointly zero: one
-    that is correlated with a base parameter is certain as a whole and uncertain in every figure.
+    An effect that several figures show is significant if what it adds as a whole is: of a narrow play the width times
+    the slope is certain, and neither figure is.
     """
     placed, at_bound = fitted.model.placed[k], fitted.at_bound
-    stuck = tuple(n for n in placed.effect.essential if f"{placed.label}.{n}" in at_bound)
+    effect = placed.effect
+    stuck = tuple(n for n in effect.essential if f"{placed.label}.{n}" in at_bound)
     if stuck:
         return Doubt(k, "at_limit", stuck)
-    plain = tuple(n for n, span in placed.effect.plain_in.items() if n in parameters and reaches(parameters[n], span))
+    plain = tuple(n for n, span in effect.plain_in.items() if n in parameters and reaches(parameters[n], span))
     if plain:
         return Doubt(k, "holds_plain", plain)
-    own, weights = fitted.model.slices(k)
-    showing = weights.stop - weights.start - placed.weights_beside
-    whole = own.start == own.stop and len(placed.effect.vanishes_with) == 1 and showing > 1
-    if whole and unsure.chance_of_none(k, showing) < 0.05:
-        return None
-    absent = absent_groups(placed.effect, parameters)
+    absent = absent_groups(effect.plain_without, parameters)
+    if not absent and (effect.vanishes_with or not effect.plain_without):
+        absent = absent_groups(effect.vanishes_with or (("*",),), parameters)
+        if absent and _adds_something(fitted, k, unsure):
+            return None
     return Doubt(k, "holds_zero", tuple(dict.fromkeys(n for of in absent for n in of))) if absent else None
+
+
+def _adds_something(fitted: Fit, k: int, unsure: Uncertainty) -> bool:
+    """Return True if what effect ``k`` adds differs significantly from nothing, whatever each of its figures is."""
+    placed = fitted.model.placed[k]
+    own, weights = fitted.model.slices(k)
+    searched, showing = own.stop - own.start, weights.stop - weights.start - placed.weights_beside
+    figures = sum(len(group) for group in placed.effect.vanishes_with)
+    if searched + showing < 2 or not figures or (searched and figures < 2):
+        return False
+    return unsure.chance_of_none(k, searched + showing) < 0.05

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -77,8 +77,8 @@ class Uncertainty:
     ``moved`` (blocks, parameters): shift of the parameters by each block of the data; ``plain`` and ``coloured``
     (parameters, parameters): their covariance for a white residual, and for one with the spectrum of its
     autoregression; ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form
-    of the model. ``whole`` has, for every effect that has only weights, the variance of a factor of all of
-    them but those of a curve beside it.
+    of the model. ``whole`` returns the variance of a factor of all that an effect adds to the outputs but a curve
+    beside it.
     """
 
     moved: Array
@@ -86,7 +86,7 @@ class Uncertainty:
     coloured: Array
     own: Array
     beyond: float
-    whole: Mapping[int, float]
+    whole: Callable[[int], float]
 
     def spread(self, gradients: Array) -> Array:
         """Return standard deviations (k,) of quantities with these ``gradients`` (k, parameters).
@@ -98,12 +98,12 @@ class Uncertainty:
         accounts += [np.einsum("ij,jk,ik->i", gradients, c, gradients) for c in (self.plain, self.coloured)]
         return np.sqrt(np.maximum(np.max(accounts, axis=0), 0.0) * self.beyond + gradients**2 @ self.own)
 
-    def chance_of_none(self, k: int, weights: int) -> float:
-        """Return the p-value that all ``weights`` of effect ``k``, which has only weights, are zero (Wald's test).
+    def chance_of_none(self, k: int, figures: int) -> float:
+        """Return the p-value that effect ``k`` with ``figures`` parameters adds nothing (Wald's test).
 
         Parameters that cancel each other are jointly certain although each is uncertain.
         """
-        return float(chi2.sf(1.0 / (self.whole[k] * self.beyond), max(weights, 1)))
+        return float(chi2.sf(1.0 / (self.whole(k) * self.beyond), max(figures, 1)))
 
     def deviations(self) -> Array:
         """Return the standard deviation of each parameter (parameters,)."""
@@ -134,28 +134,42 @@ def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
     priors = _priors(fitted) / stride
     accounts = partial(_accounts, problem, r=r, blocks=blocks, thinned=stride > 1)
     moved, plain, coloured = accounts(j / size, priors=priors / size**2)
-    whole = dict[int, float]()
-    for k in range(len(fitted.model.placed)):
+
+    def factor(k: int) -> float:
         own, weights = fitted.model.slices(k)
-        if own.start == own.stop:
-            # all weights as one column: their matrix may be too nearly singular to be inverted
-            weights = slice(weights.start, weights.stop - fitted.model.placed[k].weights_beside)
-            v = fitted.theta[weights]
-            if not np.any(v):
-                whole[k] = np.inf
-                continue
-            others = np.delete(np.arange(size.size), np.arange(weights.start, weights.stop))
-            column = j[:, weights] @ v
-            norm = max(float(np.linalg.norm(column)), 1e-150)
-            joined = np.column_stack([j[:, others] / size[others], column / norm])
-            small = np.r_[priors[others] / size[others] ** 2, float(v @ (priors[weights] * v)) / norm**2]
-            m, p, c = accounts(joined, priors=small)
-            whole[k] = max(float(np.sum(m[:, -1] ** 2)), float(p[-1, -1]), float(c[-1, -1])) / norm**2
+        figures = np.r_[own, weights.start : weights.stop - fitted.model.placed[k].weights_beside]
+        column = _added(problem, fitted, j, rows, k)
+        norm = float(np.linalg.norm(column))
+        if norm <= 1e-150:
+            return np.inf
+        # all figures as one column: their matrix may be too nearly singular to be inverted
+        others, v = np.delete(np.arange(size.size), figures), fitted.theta[figures]
+        joined = np.column_stack([j[:, others] / size[others], column / norm])
+        small = np.r_[priors[others] / size[others] ** 2, float(v @ (priors[figures] * v)) / norm**2]
+        m, p, c = accounts(joined, priors=small)
+        return max(float(np.sum(m[:, -1] ** 2)), float(p[-1, -1]), float(c[-1, -1])) / norm**2
+
     idle = size < 1e-6 * np.sqrt(rows.size) / np.maximum(_ranges(fitted), 1e-300)
     scale = np.where(idle, 0.0, 1.0 / size)
     own = np.where(idle, (_ranges(fitted) / 3.92) ** 2, 0.0)
     both = np.outer(scale, scale)
-    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth), whole)
+    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, smooth), factor)
+
+
+def _added(problem: Problem, fitted: Fit, j: Array, rows: Rows, k: int) -> Array:
+    """Return what effect ``k`` adds to the noise-weighted outputs on ``rows``, without a curve beside it.
+
+    ``j``: the Jacobian there.
+    """
+    model, theta = fitted.model, fitted.theta
+    own, weights = model.slices(k)
+    weights = slice(weights.start, weights.stop - model.placed[k].weights_beside)
+    if own.start == own.stop:
+        return j[:, weights] @ theta[weights]
+    stack = lambda y: np.concatenate([y[o][rows] / problem.sigma(o) for o in problem.twin.outputs])  # noqa: E731
+    without = Model(problem.twin, [p for i, p in enumerate(model.placed) if i != k])
+    at = without.carry(model, theta, problem.recording)
+    return stack(model.simulate(problem.view, theta)) - stack(without.simulate(problem.view, at))
 
 
 def _accounts(
