@@ -13,6 +13,7 @@ from sim_devices.physics.effect import Context
 from sim_devices.physics.hysteresis import CURVES, FORMS
 from tests.unit.mismatch_engine.cases import RATE, among, named, recording, wave
 from tools.mismatch.engine.evidence import Doubt, absent_groups, doubt_of, holds_zero
+from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.pose import Ended, prepared
 from tools.mismatch.engine.report import ParameterValue, Report, Withheld
@@ -147,6 +148,33 @@ def test_of_several_sizes_one_may_be_away_from_zero_by_chance() -> None:
     nothing = ParameterValue(0.0, "1", (-1.0, 1.0))
     assert absent_groups(spring.vanishes_with, {"cubic_stiffness": nothing, "quadratic_stiffness": barely})
     assert not absent_groups(spring.vanishes_with, {"cubic_stiffness": nothing, "quadratic_stiffness": clear})
+
+
+def narrow_play(loss: float) -> Recording:
+    """A stack that loses ``loss`` of its response inside a play of 0.1 V, at 0.2 um/V and 3 nm of noise."""
+    rng = np.random.default_rng(5)
+    volts = 50.0 + 40.0 * wave(rng, 4000, low=3.0, high=20.0)  # a sample moves further than the play is wide
+    inside, p = np.empty(volts.size), float(volts[0])
+    for i, v in enumerate(volts.tolist()):
+        p = max(v - 0.05, min(v + 0.05, p))
+        inside[i] = v - p
+    um = 1.0 + 0.2 * (volts - loss * inside) + rng.normal(0, 0.003, volts.size)
+    return recording("piezo_stack", {"command": volts}, {"displacement": um}, {"gain_um_per_V": 0.2, "offset_um": 1.0})
+
+
+def test_of_a_narrow_play_only_the_width_times_the_slope_is_certain() -> None:
+    names, _, store = weighed(narrow_play(0.06), "backlash")
+    assert names == {"backlash"}
+    fitted = next(s.fitted for s in store.sets.values() if s.placed)
+    unsure = uncertainty(store.problem, fitted)
+    values = human_values(store.problem, fitted, unsure)["backlash[displacement]"]
+    assert absent_groups(EFFECTS["backlash"].vanishes_with, values)
+    # width times slope: 0.1 V times 0.06, known to a tenth
+    area = values["gap"].value * values["slope_lost_inside"].value
+    assert area == pytest.approx(0.006, rel=0.3)
+    names, withheld, _ = weighed(narrow_play(0.0), "backlash")
+    assert not names
+    assert [w.reason for w in withheld] == ["holds_zero"]
 
 
 def test_a_loop_whose_change_with_speed_may_be_zero_is_a_plain_loop() -> None:

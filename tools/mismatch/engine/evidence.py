@@ -7,6 +7,7 @@ named, with the reason.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -14,6 +15,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from scipy.stats import norm
 
+from sim_devices.physics.effect import Parameter
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.report import ParameterValue, WithheldReason
@@ -80,11 +82,21 @@ def doubt_of(fitted: Fit, k: int, parameters: Mapping[str, ParameterValue], unsu
 
 
 def _adds_something(fitted: Fit, k: int, unsure: Uncertainty) -> bool:
-    """Return True if what effect ``k`` adds differs significantly from nothing, whatever each of its figures is."""
+    """Return True if what effect ``k`` adds differs significantly from nothing, whatever each of its figures is.
+
+    The best of all values of the searched figures is tested, which do not exist where there is nothing (R. B. Davies,
+    Biometrika 64, 1977, 247): the p-value is corrected for the values that the data could tell apart.
+    """
     placed = fitted.model.placed[k]
     own, weights = fitted.model.slices(k)
-    searched, showing = own.stop - own.start, weights.stop - weights.start - placed.weights_beside
-    figures = sum(len(group) for group in placed.effect.vanishes_with)
-    if searched + showing < 2 or not figures or (searched and figures < 2):
+    searched = fitted.model.parameters[own]
+    figures = len(searched) + weights.stop - weights.start - placed.weights_beside
+    sizes = sum(len(group) for group in placed.effect.vanishes_with)
+    if figures < 2 or not sizes or (searched and sizes < 2):
         return False
-    return unsure.chance_of_none(k, searched + showing) < 0.05
+    return unsure.chance_of_none(k, figures) * math.prod(_cells(p) for p in searched) < 0.05
+
+
+def _cells(p: Parameter) -> float:
+    """Return the number of typical steps of a parameter between its bounds, at least one."""
+    return max((p.hi - p.lo) / p.scale, 1.0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tools.mismatch.engine.events import half_widths
+from tools.mismatch.engine.evidence import absent_groups
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.problem import Problem
@@ -141,6 +142,7 @@ def physics_found(
                 raw,
                 placed.note,
                 tuple(n for n in fitted.at_bound if n.startswith(placed.label + ".")),
+                bool(absent_groups(placed.effect.vanishes_with, parameters)),
             )
         )
     return out

@@ -58,7 +58,10 @@ class ParameterValue:
 
 @dataclass(frozen=True)
 class PhysicsFound:
-    """Holds an accepted effect. ``apply`` needs ``site``, ``target``, ``outputs``, ``settings`` and ``raw``."""
+    """Holds an accepted effect. ``apply`` needs ``site``, ``target``, ``outputs``, ``settings`` and ``raw``.
+
+    ``only_whole``: what it adds is certain, and each figure alone may be zero.
+    """
 
     name: str
     output: str
@@ -76,6 +79,7 @@ class PhysicsFound:
     raw: Mapping[str, float]
     note: str = ""
     at_bound: tuple[str, ...] = ()
+    only_whole: bool = False
 
 
 @dataclass(frozen=True)

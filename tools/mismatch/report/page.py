@@ -58,6 +58,7 @@ def html_page(report: Report) -> str:
         percent=percent,
         words=words,
         scaled=wording.scaled,
+        only_whole=wording.ONLY_WHOLE,
         why_withheld=wording.why_withheld,
         meaning=wording.meaning(report),
         physics_title=wording.physics_title(report),

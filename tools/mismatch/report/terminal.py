@@ -64,6 +64,8 @@ def _physics(k: int, p: PhysicsFound, report: Report) -> RenderableType:
         rows.append(("place", inside))
     if p.note:
         rows.append(("place", f"{p.note}: this recording cannot tell"))
+    if p.only_whole:
+        rows.append(("size", wording.ONLY_WHOLE))
     if p.at_bound:
         rows.append(("caution", f"at the limit of what is searched: {', '.join(p.at_bound)}"))
     return Group(head, Padding(Group(t, pairs_of(rows)), (0, 0, 0, 3)))

@@ -47,6 +47,7 @@ FOLLOWS_NOTHING = (
     " input at rest show what is there without the input"
 )
 """Meaning of ``unknown`` where the residual depends on nothing that was recorded."""
+ONLY_WHOLE = "certain as a whole; each figure alone may be zero"
 UNSURE = 0.75
 """Probability of a name below which an equally good rival is named beside it."""
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
