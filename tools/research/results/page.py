@@ -55,6 +55,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "heal": ("Kept remedies", "Reverted remedies"),
     "plan": ("Why a planned", "By pair", "Pairs that"),
     "together": ("Not named",),
+    "together-public": (),
     "watch": (),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
