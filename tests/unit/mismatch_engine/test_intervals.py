@@ -12,9 +12,11 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
+from tools.mismatch.engine.evidence import holds_zero
 from tools.mismatch.engine.found import human_values, physics_found, values_of_forms
 from tools.mismatch.engine.intervals import few_blocks, uncertainty
 from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.engine.trial import extended
@@ -82,6 +84,27 @@ def test_what_the_data_do_not_move_is_as_wide_as_its_bounds() -> None:
     sd = float(uncertainty(problem, replace(base, model=model, theta=theta)).deviations()[rate])
     p = model.parameters[rate]
     assert 1.96 * sd == pytest.approx(0.5 * (p.hi - p.lo), rel=1e-3)
+
+
+def test_of_two_figures_that_only_act_as_a_product_neither_is_certain() -> None:
+    # a zone of 20 mV in which no sample is: the output moves by its width times the slope that it loses
+    volts = 50 + 30 * wave(np.random.default_rng(5), 3000)
+    volts += np.where(np.abs(volts - 50) < 0.02, np.copysign(0.05, volts - 50), 0.0)
+    um = 0.125 * (volts - np.clip(volts - 50, -0.01, 0.01)) + 2e-4 * np.random.default_rng(6).standard_normal(3000)
+    made = recording(
+        "piezo_stack", {"command": volts}, {"displacement": um}, {"gain_um_per_V": 0.125, "offset_um": 0.0}
+    )
+    problem, _, base = prepared(made, 0.3, 0, False)
+    placed = replace(places(problem, (EFFECTS["dead_zone"],), ())[0], settings={"range": (20.0, 80.0)})
+    model, theta = extended(problem, base, placed)
+    theta[:2] = problem.given
+    theta[-3:] = 0.01, 50.0, 0.125
+    fitted = replace(base, model=model, theta=theta, residual=residuals(problem, model, theta))
+    unsure = uncertainty(problem, fitted)
+    found = human_values(problem, fitted, unsure)[placed.label]
+    assert found["half_width"].ci95 == pytest.approx((0.006, 27.0))  # its bounds
+    assert holds_zero(found["slope_lost_inside"])
+    assert unsure.chance_of_none(0, 2) < 1e-6
 
 
 def test_the_instant_of_a_step_has_an_interval() -> None:

@@ -22,6 +22,9 @@ from tools.mismatch.simulate import Model
 
 Rows = NDArray[np.int64]
 
+LEAST_SQUARE = 1e-12
+"""Least square of a direction of parameters, as a share of the largest: below it is rounding."""
+
 
 def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
     """Return the sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters).
@@ -180,7 +183,9 @@ def _accounts(
     ``r`` (rows,): residual; ``blocks`` (rows,): its blocks; ``priors`` (k,): precisions.
     """
     small = np.diag(priors)
-    bread = np.linalg.pinv(js.T @ js + small, rcond=1e-12)
+    squares, axes = np.linalg.eigh(js.T @ js + small)
+    # a direction that moves nothing, as width against slope of a zone that no sample is in, is not certain
+    bread = (axes / np.maximum(squares, LEAST_SQUARE * squares[-1])) @ axes.T
     scores = np.zeros((len(problem.fit_blocks), js.shape[1]))
     np.add.at(scores, blocks, js * r[:, None])
     moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
