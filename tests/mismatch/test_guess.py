@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from tools.mismatch.guess import POINTS, guess, main
 from tools.mismatch.guess_roles import guess_role, split_unit
 from tools.mismatch.new import new_recording
 from tools.mismatch.recording_load import load
+from tools.mismatch.text_table import text_table
 
 
 @pytest.mark.parametrize(
@@ -301,7 +303,27 @@ def test_a_date_in_another_form_is_told_the_one_that_is_read(tmp_path: Path):
     rows = "".join(f"10/03/2004;{k};{np.sin(k)};{np.cos(k)}\n" for k in range(80))
     (tmp_path / "a.csv").write_text(f"Date;t_s;u_V;y_mm\n{rows}")
     (note,) = (n for n in guess(tmp_path / "a.csv").notes if "Date" in n)
-    assert note.endswith("a date is read as 2026-03-10 18:00:00, with the time of day, in one column")
+    assert note.endswith("a date is read as 2026-03-10 18:00:00")
+
+
+@pytest.mark.parametrize(
+    ("head", "cells"),
+    [
+        ("day,time", "2026-03-10,18:{:02}:00"),
+        ("when", "2026-03-10 18:{:02}:00"),
+        ("when", "2026-03-10T18:{:02}:00.0+01:00"),
+        ("day,clock", "2026-03-10,18:{:02}+0100"),
+    ],
+)
+def test_dates_of_loggers_are_the_time(tmp_path: Path, head: str, cells: str):
+    rows = "".join(f"{cells.format(k)},{np.sin(k)},{np.cos(k)}\n" for k in range(60))
+    (tmp_path / "a.csv").write_text(f"{head},u_V,y_mm\n{rows}")
+    found = guess(tmp_path / "a.csv")
+    assert found.time_column == head.split(",")[0]
+    assert found.rate_hz == pytest.approx(1 / 60)
+    begin = datetime(2026, 3, 10, 18, tzinfo=UTC).timestamp() - (3600.0 if "+01" in cells else 0.0)
+    assert text_table(tmp_path / "a.csv").read([found.time_column])[found.time_column][0] == begin
+    assert sum("time of day" in n for n in found.notes) == head.count(",")
 
 
 @pytest.mark.parametrize(("mark", "told"), [(-200.0, True), (-1.0, False), (3.0, False)])

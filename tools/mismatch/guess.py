@@ -47,7 +47,7 @@ from tools.mismatch.recording_columns import (
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.stamps import StampReader, Stamps
-from tools.mismatch.text_table import A_DATE, BLOCK_ROWS
+from tools.mismatch.text_table import A_DATE, BLOCK_ROWS, TIME_OF_DAY
 from tools.mismatch.twins.vocabulary import KINDS, vocabulary
 
 POINTS = 240
@@ -158,6 +158,14 @@ class _Column:
         )  # fmt: skip
 
 
+def _of_words(name: str, first: str) -> str:
+    """Return the note on a column without numbers whose first cell is ``first``."""
+    if re.fullmatch(TIME_OF_DAY, first):
+        return f"column '{name}' holds the time of day: it is read if the day stands in the column before it"
+    found = f"column '{name}' is not used: it holds words ('{first}')"
+    return f"{found}; a date is read as {A_DATE}" if _LIKE_A_DATE.match(first) else found
+
+
 def guess(path: Path, kind: str = "") -> Guess:
     """Read a data file in blocks and propose what its columns are; ``kind`` is the twin where a person named one.
 
@@ -169,11 +177,7 @@ def guess(path: Path, kind: str = "") -> Guess:
     twice = [k for k in dict.fromkeys(names) if names.count(k) > 1]
     names = [k for k in names if k not in twice]
     notes = [f"column '{k}' is not used: more than one has this name" for k in twice]
-    notes += [
-        f"column '{name}' is not used: it holds words ('{first}')"
-        + (f"; a date is read as {A_DATE}, with the time of day, in one column" if _LIKE_A_DATE.match(first) else "")
-        for name, first in words_in(path)
-    ]
+    notes += [_of_words(name, first) for name, first in words_in(path)]
     unknown_units = {k: u for k, u in file_units.items() if u and not units.is_unit(u)}
     notes += [f"column '{k}': its unit '{u}' in the file is not known" for k, u in unknown_units.items()]
     row = first_line(path)

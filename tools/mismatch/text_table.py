@@ -1,6 +1,6 @@
 """Reads tables of numbers in text files: any delimiter, decimal comma or point, optional header and row of units.
 
-Dates with a time of day as ISO 8601 writes them are seconds since 1970.
+Dates with a time of day as ISO 8601 writes them are seconds since 1970; the time may stand in the next column.
 
 The form is found from the first part of the file. Rows are read in blocks, so that a file may be larger than memory.
 """
@@ -34,7 +34,8 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 _COMMENT = ("#", "%")
 A_DATE = "2026-03-10 18:00:00"
 """A date as it is read."""
-_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?Z?")
+_DAY, TIME_OF_DAY = r"\d{4}-\d\d-\d\d", r"\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?"
+_DATE = re.compile(f"{_DAY}[T ]{TIME_OF_DAY}")
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,7 @@ class TextTable:
 
     def _seconds(self, number: int, line: str, column: int) -> float:
         """Return the date in a line in seconds since 1970."""
-        cells = _cells(line, self.delimiter)
-        cell = cells[column] if column < len(cells) else ""
+        cell = _date(_cells(line, self.delimiter), column)
         if cell.lower() in MISSING:
             return float("nan")
         try:
@@ -180,7 +180,7 @@ def text_table(path: Path) -> TextTable:
     row = plain[begin][1] if begin < len(plain) else []
     dates = tuple(
         name for i, name in enumerate(names)
-        if i < len(row) and any(of_numbers) and _DATE.fullmatch(row[i])
+        if any(of_numbers) and _DATE.fullmatch(_date(row, i))
     )  # fmt: skip
     words = [
         (name, row[i])
@@ -237,6 +237,12 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
     except csv.Error:
         return [cell.strip() for cell in line.split(delimiter)]
+
+
+def _date(cells: list[str], column: int) -> str:
+    """Return the date in ``column``; where it is a day alone, with the time of day from the next column."""
+    cell, after = (cells[i] if i < len(cells) else "" for i in (column, column + 1))
+    return f"{cell} {after}" if re.fullmatch(_DAY, cell) and re.fullmatch(TIME_OF_DAY, after) else cell
 
 
 def _is_number(cell: str, decimal: str) -> bool:

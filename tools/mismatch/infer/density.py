@@ -16,6 +16,7 @@ from scipy.stats import t as student
 from hal.arrays import Array
 from tools.mismatch.engine.features import curve, standard
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.intervals import before_rounding
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import robust_scale
 from tools.mismatch.placed import Placed
@@ -48,12 +49,21 @@ def student_log_density(r: Array, scale: float) -> Array:
 
 
 def undone(problem: Problem, fitted: Fit, output: str, placed: Sequence[int]) -> Array:
-    """Return the residual (m,) of ``output`` with the fitted courses of the effects ``placed`` added back."""
-    model, theta = fitted.model, fitted.theta.copy()
-    for k in placed:
-        _, weights = model.slices(k)
-        theta[weights] = 0.0
-    return problem.measured[output] - model.simulate(problem.view, theta, (output,))[output]
+    """Return the residual (m,) of ``output`` with the fitted courses of the effects ``placed`` added back.
+
+    A course is taken before it is rounded: the difference of two rounded readings follows all that they contain.
+    """
+    smooth = before_rounding(problem, fitted)
+    chosen = [fitted.model.placed[k] for k in placed]
+    theta = smooth.theta.copy()
+    for k, p in enumerate(smooth.model.placed):
+        if p in chosen:
+            theta[smooth.model.slices(k)[1]] = 0.0
+    without = smooth.model.simulate(problem.view, theta, (output,))[output]
+    if smooth is fitted:
+        return problem.measured[output] - without
+    whole = smooth.model.simulate(problem.view, smooth.theta, (output,))[output]
+    return fitted.residual[output] + whole - without
 
 
 def prediction(problem: Problem, fitted: Fit, output: str) -> tuple[Array, Array]:

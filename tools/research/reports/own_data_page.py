@@ -83,7 +83,7 @@ The command reads text tables (any delimiter, decimal comma, header or none, a r
 {endings}.
 What it could not know it writes into the file as a comment. A column `t`
 without a unit is read as seconds; `--rate HZ` corrects it, or stands for a missing one. `t_ms`, `t_min`,
-`t_h` and dates (`2026-03-10 18:00:00`) are read as they say.
+`t_h` and dates (`2026-03-10 18:00:00`, or the day and the time in two columns) are read as they say.
 
 Where time steps are uneven or values are missing, the command names the line and writes nothing;
 `--cut` resamples the columns to even steps at their usual rate (`--resample HZ`: another) and cuts them at gaps.
