@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -49,13 +50,11 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (
-        Human("gap", 2 * float(p[0]), "{in}"),
-        Human("slope_lost_inside", float(p[2] / scale) if scale else 0.0, "1"),
-    )
+    lost = (Human("slope_lost_inside", float(p[2] / scale) if scale else 0.0, "1"),) if p.size > 2 else ()
+    return (Human("gap", 2 * float(p[0]), "{in}"), *lost)
 
 
-BACKLASH = Effect(
+_PARTIAL = Effect(
     name="backlash",
     summary="free play: output stands still for a fixed travel after each reversal",
     kind="add",
@@ -75,3 +74,15 @@ BACKLASH = Effect(
     estimated=("slope_lost_inside",),
     essential=("half_gap",),
 )
+_WHOLE = replace(
+    _PARTIAL,
+    kind="nonlinear",
+    parts=lambda settings: Parts(_parts(settings).nonlinear),
+    equation="y = P_r[x]",
+    apply=lambda x, ctx, q, settings: x - in_gap(x, q[:1], q[1], ctx.starts)[:, 0],
+    basis=None,
+    vanishes_with=(("gap",),),
+    limits={},
+    estimated=(),
+)
+BACKLASH = replace(_PARTIAL, variants=(_WHOLE,))

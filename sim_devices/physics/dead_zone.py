@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,12 +38,13 @@ def _dead_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 
 def _dead_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    share = p[2] / scale if scale else 0.0
+    whole = p.size < 3
+    lost = 1.0 if whole else float(p[2] / scale) if scale else 0.0
     return (
         Human("half_width", float(p[0]), "{in}"),
         Human("centre", float(p[1]), "{in}"),
-        Human("slope_lost_inside", float(share), "1"),
-        Human("response_beyond", _response_beyond(float(p[0]), float(p[1]), float(share), settings), "1"),
+        *(() if whole else (Human("slope_lost_inside", lost, "1"),)),
+        Human("response_beyond", _response_beyond(float(p[0]), float(p[1]), lost, settings), "1"),
     )
 
 
@@ -60,7 +62,7 @@ def _response_beyond(half_width: float, centre: float, lost: float, settings: Se
     return (max(beyond, 0.0) + inside) / (hi - lo)
 
 
-DEAD_ZONE = Effect(
+_PARTIAL = Effect(
     name="dead_zone",
     summary="no response for small inputs",
     kind="add",
@@ -81,3 +83,15 @@ DEAD_ZONE = Effect(
     vanishes_with=(("half_width",), ("slope_lost_inside",)),
     essential=("half_width",),
 )
+_WHOLE = replace(
+    _PARTIAL,
+    kind="nonlinear",
+    parts=lambda settings: Parts(_dead_parts(settings).nonlinear),
+    equation=r"y = x - \mathrm{clip}(x - c, -h, h)",
+    apply=lambda x, ctx, q, settings: x - np.clip(x - q[1], -q[0], q[0]),
+    basis=None,
+    limits={"response_beyond": (LEAST_BEYOND, 1.0)},
+    estimated=(),
+    vanishes_with=(("half_width",),),
+)
+DEAD_ZONE = replace(_PARTIAL, variants=(_WHOLE,))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import among, recording, wave
@@ -13,16 +14,18 @@ from tests.unit.mismatch_engine.test_hold_and_one_way import axis
 from tools.mismatch.engine import pose as preparation
 from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.pose import Ended, Posed
+from tools.mismatch.engine.pose import Ended, Posed, prepared
 from tools.mismatch.engine.report import Hold, Report
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.trial import Effort
+from tools.mismatch.engine.trial import Effort, extended
+from tools.mismatch.engine.vary import size
 from tools.mismatch.infer import borne_out as infer_borne_out
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer import run as infer_run
 from tools.mismatch.infer.borne_out import borne_out
 from tools.mismatch.infer.constants import START
-from tools.mismatch.infer.decide import decide
+from tools.mismatch.infer.decide import decide, rounding_left
 from tools.mismatch.infer.density import gain_of_events
 from tools.mismatch.infer.run import infer, report_of
 from tools.mismatch.infer.store import outputs_at_odds
@@ -103,6 +106,55 @@ def test_one_clipped_channel_of_three_is_named() -> None:
     r = recording("accelerometer", inputs, outputs, believed)
     report = diagnose(r, jobs=1, constants=START, effects=[EFFECTS["saturation"], EFFECTS["first_order_lag"]])
     assert [p.name for p in report.physics] == ["saturation"]
+
+
+def three_axes(changes: dict[str, np.ndarray], rms: float = 1e-3) -> Recording:
+    """A triad of accelerometers with white noise, and ``changes`` on top of its readings."""
+    rng = np.random.default_rng(11)
+    force = {f"specific_force_{a}": wave(np.random.default_rng(k), N) for k, a in enumerate("xyz")}
+    volts = {
+        f"voltage_{a}": 2.5 + 0.66 * force[f"specific_force_{a}"] + rms * rng.standard_normal(N)
+        + changes.get(f"voltage_{a}", 0.0)
+        for a in "xyz"
+    }  # fmt: skip
+    given: dict[str, object] = {"bias_V": [2.5] * 3, "scale_V_per_g": [0.66] * 3}
+    return recording("accelerometer", force, volts, given)
+
+
+def test_parameters_of_one_output_of_three_count_as_their_share_of_the_mean() -> None:
+    t = np.arange(N) / 100.0
+    hum = {f"voltage_{a}": 0.05 * np.sin(2 * np.pi * 31.7 * t + k) for k, a in enumerate("xyz")}
+    store = infer(three_axes(hum), START, jobs=1, effects=[EFFECTS["vibration"]]).found.store
+    assert store.outputs == pytest.approx(3.0, abs=0.1)
+    one = next(s for s in store.sets.values() if len(s.placed) == 1)
+    assert one.parameters == pytest.approx(size(one.placed[0]) / store.outputs)
+
+
+def test_an_output_that_no_effect_touches_may_have_noise_of_any_colour() -> None:
+    slow = lfilter([1.0], [1.0, -0.8], np.random.default_rng(3).standard_normal(N))
+    made = three_axes({"voltage_x": 0.004 * slow})
+    y = made.outputs["voltage_y"]
+    made = replace(made, outputs={**made.outputs, "voltage_y": np.clip(y, 2.1, 2.95)})
+    report = diagnose(made, jobs=1, effects=[EFFECTS["saturation"]])
+    assert [(p.name, p.output) for p in report.physics] == [("saturation", "voltage_y")]
+    assert report.verdict == "missing_physics"
+
+
+@pytest.mark.parametrize("rms", [0.05, 0.15, 0.4])
+def test_a_quantiser_leaves_what_noise_in_front_of_it_decides(rms: float) -> None:
+    u = 40.0 * wave(np.random.default_rng(3), 20 * N)
+    rng = np.random.default_rng(9)
+    y = np.round(0.12 * u + rms * rng.standard_normal(20 * N))
+    made = recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
+    problem, _, base = prepared(made, 0.3, 0, False)
+    (place, *_) = places(problem, [EFFECTS["quantization"]], ())
+    model, theta = extended(problem, base, replace(place, settings={"step": (1.0,), "origin": (0.0,)}))
+    theta[:2] = 0.0, 0.12
+    theta[model.slices(0)[0]] = rms
+    fitted = replace(base, model=model, theta=theta, residual=residuals(problem, model, theta))
+    left = float(np.std(fitted.residual["displacement"][problem.held_rows]))
+    assert rounding_left(problem, fitted, "displacement") == pytest.approx(left, rel=0.1)
+    assert rounding_left(problem, base, "displacement") == 0.0
 
 
 def test_refinement_is_for_candidates_that_could_be_extended() -> None:

@@ -191,3 +191,24 @@ def test_a_gap_begins_where_it_was_left(first: float) -> None:
     np.testing.assert_allclose(gone[up], x[up] - 2.0 + 0.3 * first, atol=1e-12)
     np.testing.assert_allclose(gone[(t <= 1.0) & ~still], 0.3, atol=1e-12)
     np.testing.assert_allclose(gone[-1], -0.3, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "figures"), [("backlash", (0.3, 0.2)), ("dead_zone", (0.3, 0.1))])
+def test_a_form_that_loses_the_whole_slope_is_the_general_one_with_a_share_of_one(
+    name: str, figures: tuple[float, ...]
+) -> None:
+    t = np.arange(900) * 0.01
+    x = np.sin(2 * t) * (1 + np.sin(0.7 * t))
+    partial = EFFECTS[name]
+    (whole,) = partial.variants
+    q, ctx = np.array(figures), context(t, x, x)
+    assert partial.basis is not None
+    assert whole.apply is not None
+    settings = partial.prepare(x, x, ctx)
+    np.testing.assert_allclose(whole.apply(x, ctx, q, settings), x + partial.basis(x, ctx, q, settings)[:, 0])
+    assert [p.name for p in whole.parts(settings).weights] == []
+    assert partial.report is not None
+    assert whole.report is not None
+    general = {h.name: h.value for h in partial.report(np.r_[q, 2.0], settings, 2.0)}
+    assert general.pop("slope_lost_inside") == 1.0
+    assert {h.name: h.value for h in whole.report(q, settings, 2.0)} == general

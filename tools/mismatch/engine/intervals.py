@@ -185,7 +185,7 @@ def _accounts(
     small = np.diag(priors)
     squares, axes = np.linalg.eigh(js.T @ js + small)
     # a direction that moves nothing, as width against slope of a zone that no sample is in, is not certain
-    bread = (axes / np.maximum(squares, LEAST_SQUARE * squares[-1])) @ axes.T
+    bread = (axes / np.maximum(squares, max(LEAST_SQUARE * squares.max(initial=0.0), 1e-300))) @ axes.T
     scores = np.zeros((len(problem.fit_blocks), js.shape[1]))
     np.add.at(scores, blocks, js * r[:, None])
     moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))

@@ -257,12 +257,17 @@ def _creep(s: Slot, x: str, d: str) -> str:
 
 def _backlash(s: Slot, x: str, d: str) -> str:
     play = s.part("stops", f"[{s.at('half_gap')}], first={s.at('first_in_gap')}")
-    return f"{x} - {s.at('missing_slope')} * {play}({d})[:, 0]"
+    return f"{x} - {_lost(s)}{play}({d})[:, 0]"
+
+
+def _lost(s: Slot) -> str:
+    """Return the factor of a slope that is lost in part; none where it is lost whole."""
+    return f"{s.at('missing_slope')} * " if "missing_slope" in s.values else ""
 
 
 def _dead_zone(s: Slot, x: str, d: str) -> str:
     width = s.at("half_width")
-    return f"{x} - {s.at('missing_slope')} * np.clip({d} - {s.at('centre')}, -{width}, {width})"
+    return f"{x} - {_lost(s)}np.clip({d} - {s.at('centre')}, -{width}, {width})"
 
 
 def _curve(s: Slot, x: str, d: str) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.intervals import before_rounding
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Withheld
@@ -288,10 +289,10 @@ class Rest:
     floors: Mapping[str, tuple[float, float]]
 
 
-def rest_of(problem: Problem, fitted: Fit, *, of_any_colour: bool = False) -> Rest:
+def rest_of(problem: Problem, fitted: Fit, of_any_colour: Collection[str] = ()) -> Rest:
     """Return the rest of a model.
 
-    The rest is real if it follows a signal or if it is louder than the noise can be, which may be noise
+    The rest is real if it follows a signal or if it is louder than the noise can be, which on some outputs may be noise
     ``of_any_colour``. Readings on a lattice are as loud as its rounding, because beside an edge the side is unknown.
     """
     rest = unpredicted(problem, fitted)
@@ -302,12 +303,30 @@ def rest_of(problem: Problem, fitted: Fit, *, of_any_colour: bool = False) -> Re
         follows = max((d.strength for d in v.follows), default=0.0) if v.real else 0.0
         held = rest.residual[o][problem.held_rows]
         low, most = floor_interval(
-            problem.floors[o], held, follows, 1 / problem.recording.dt, of_any_colour=of_any_colour
-        )  # fmt: skip
-        most = max(most, problem.floors[o].step / math.sqrt(12.0))
+            problem.floors[o], held, follows, 1 / problem.recording.dt, of_any_colour=o in of_any_colour
+        )
+        low = max(low, rounding_left(problem, fitted, o))
+        most = max(most, problem.floors[o].step / math.sqrt(12.0), low)
         left[o] = replace(v, real=v.real or v.ratio * problem.sigma(o) ** 2 > LOUD * most**2)
         floors[o] = low, most
     return Rest(rest, left, floors)
+
+
+def rounding_left(problem: Problem, fitted: Fit, output: str) -> float:
+    """Return the rms that a fitted quantiser leaves: the mean reading is predicted, not the side on which one falls.
+
+    B. Widrow, I. Kollar, Quantization Noise (2008), chapter 16: noise and rounding together, less the mean of steps.
+    """
+    model, theta = fitted.model, fitted.theta
+    placed = [k for k, p in enumerate(model.placed) if p.effect.name == "quantization" and output in p.outputs]
+    if not placed:
+        return 0.0
+    (step,), dither = model.placed[placed[0]].settings["step"], float(theta[model.slices(placed[0])[0]][0])
+    smooth = before_rounding(problem, fitted)
+    before = smooth.model.simulate(problem.view, smooth.theta, (output,))[output]
+    after = model.simulate(problem.view, theta, (output,))[output]
+    known = float(np.mean((after - before)[problem.held_rows] ** 2))
+    return math.sqrt(max(dither**2 + step**2 / 12.0 - known, 0.0))
 
 
 def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple[float, float]:
@@ -315,7 +334,7 @@ def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple
 
     With ``doubt`` the noise is as loud as it can be, else as it was estimated.
     """
-    noise = {o: max(rest.floors[o][1], problem.sigma(o)) if doubt else problem.sigma(o) for o in rest.left}
+    noise = {o: max(rest.floors[o][int(doubt)], problem.sigma(o)) for o in rest.left}
     real = {o: v.ratio * (problem.sigma(o) / noise[o]) ** 2 for o, v in rest.left.items() if v.real}
     if not real:
         return 0.0, 0.0
@@ -420,9 +439,10 @@ def judge(store: Store, chosen: Scored, strange: Stranger | None, events: Collec
     rest = rest_of(p, final.fitted)
     left, most_left = (worst_left(p, store.base.fitted, rest, doubt=doubt) for doubt in (False, True))
     quiet, loud = is_whole(*left, c), is_whole(*most_left, c)
-    if not final.placed and not quiet and strange is None:
+    bare = [o for o in p.twin.outputs if not any(o in e.outputs for e in final.placed)]
+    if bare and not quiet and strange is None:
         # what follows nothing that was recorded, and no effect explains, may be noise of any colour
-        coloured = rest_of(p, final.fitted, of_any_colour=True)
+        coloured = rest_of(p, final.fitted, bare)
         if is_whole(*worst_left(p, store.base.fitted, coloured, doubt=False), c):
             loudest = tuple(o for o, (_, hi) in coloured.floors.items() if hi > rest.floors[o][1])
             moved = ((o, louder_with(p, coloured.fit, o) or caused_by(p, coloured.fit, o)) for o in loudest)

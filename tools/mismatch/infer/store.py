@@ -147,7 +147,9 @@ class Store:
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
         free = self.count.noise / self.outputs * sum(w.free for w in every.values())
-        figures = free + sum(figures_of(e, fitted) for e in fitted.model.placed)
+        # the loss is a mean over outputs, and so is what parameters of some of them fit by chance
+        shares = [min(len(e.outputs) / self.outputs, 1.0) for e in fitted.model.placed]
+        figures = free + sum(a * figures_of(e, fitted) for a, e in zip(shares, fitted.model.placed, strict=True))
         choices = sum(self.choices_of(name) for name in {e.effect.name for e in fitted.model.placed})
         return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, choices, proper)
 
