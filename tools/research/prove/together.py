@@ -42,6 +42,8 @@ EFFECTS = (
 """Effects that every stretch of a record shows. What happens once would be in one recording of a family only."""
 GOALS = (0.9, 0)
 """Share of the families whose effect should be named, and of the null families that may name one."""
+EARLIER = """- Earlier draws of as many families, whose misses were looked at and led to changes of the engine: seed
+3011 named 16 of 20 and 0 of 100 nulls, seed 4177 named 13 of 17 and 1 of 100 nulls."""
 LEAST, MOST, USUAL = 5, 20, 400
 """Fewest and most recordings of a family, and the samples of each where the drawn case is neither short nor long."""
 
@@ -178,6 +180,7 @@ recalibration.
 - {len(rows) - len(drawn)} of {len(rows)} families could not be drawn.
 - Not run of {families} families and {nulls} nulls, for lack of processor time: {not_run(rows, families, nulls)}.
 - CPU: {sum(r["cpu_s"] for r in drawn):.0f} s.
+{EARLIER}
 
 ## Not named
 
