@@ -120,7 +120,7 @@ def _is_one_twin(first: Recording, other: Recording) -> bool:
         return True
     if _plain({**a, START: None}) != _plain({**b, START: None}):
         return False
-    return np.array_equal(*(make(r).start(r) for r in (first, other)))
+    return np.array_equal(make(first).start(first), make(other).start(other))
 
 
 def _plain(parameters: object) -> str:

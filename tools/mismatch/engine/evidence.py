@@ -15,10 +15,10 @@ from fnmatch import fnmatchcase
 import numpy as np
 from scipy.stats import norm
 
-from sim_devices.physics.effect import Parameter
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.report import ParameterValue, WithheldReason
+from tools.mismatch.placed import Free
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,6 @@ def _adds_something(fitted: Fit, k: int, unsure: Uncertainty) -> bool:
     return unsure.chance_of_none(k, figures) * math.prod(_cells(p) for p in searched) < 0.05
 
 
-def _cells(p: Parameter) -> float:
+def _cells(p: Free) -> float:
     """Return the number of typical steps of a parameter between its bounds, at least one."""
     return max((p.hi - p.lo) / p.scale, 1.0)
