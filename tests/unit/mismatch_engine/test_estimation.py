@@ -187,7 +187,8 @@ def test_slopes_on_the_outputs_that_move_are_those_of_all_outputs() -> None:
     problem, _, base = prepared(made, 0.3, 0, False)
     effects = [EFFECTS[n] for n in ("dead_zone", "channel_delay", "first_order_lag", "misalignment")]
     tried = places(problem, effects, ())
-    one = [p for p in tried if p.effect.name in ("dead_zone", "misalignment") and p.target.endswith(("_x", "_y"))]
+    # one form of each: two dead zones in a row may leave parameters that move nothing
+    one = [p for p in tried if p.effect.kind == "add" and p.target.endswith(("_x", "_y"))]
     shared = next(p for p in tried if p.effect.name == "first_order_lag" and len(p.outputs) == 3)
     model = Model(problem.twin, [prepare(Model(problem.twin), problem.fit_view, base.theta, p) for p in (*one, shared)])
     theta = model.carry(base.model, base.theta, made)

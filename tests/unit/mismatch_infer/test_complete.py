@@ -14,6 +14,7 @@ from tests.unit.mismatch_engine.test_hold_and_one_way import axis
 from tools.mismatch.engine import pose as preparation
 from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.intervals import rounding_left
 from tools.mismatch.engine.pose import Ended, Posed, prepared
 from tools.mismatch.engine.report import Hold, Report
 from tools.mismatch.engine.residual import residuals
@@ -25,7 +26,7 @@ from tools.mismatch.infer import diagnose
 from tools.mismatch.infer import run as infer_run
 from tools.mismatch.infer.borne_out import borne_out
 from tools.mismatch.infer.constants import START
-from tools.mismatch.infer.decide import decide, rounding_left
+from tools.mismatch.infer.decide import decide
 from tools.mismatch.infer.density import gain_of_events
 from tools.mismatch.infer.run import infer, report_of
 from tools.mismatch.infer.store import outputs_at_odds

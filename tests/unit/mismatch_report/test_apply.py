@@ -189,7 +189,7 @@ def _with(report: dict, *path: object, value: object) -> dict:
         (("format",), 7, "format 7, expected 1"),
         (("twin",), "magnetometer", "report is of a magnetometer"),
         (("physics", 0, "name"), "stiction", "'stiction' is not in the vocabulary"),
-        (("physics", 0, "raw"), {"half_width": 1.0}, r"parameters centre, missing_slope missing"),
+        (("physics", 0, "raw"), {"half_width": 1.0}, r"parameters centre missing"),
         (("physics", 0, "raw", "half_width"), None, "half_width missing or not finite"),
         (("physics", 0, "site"), "feedback", "cannot sit at 'feedback'"),
         (("physics", 0, "outputs"), ["angle"], "angle"),

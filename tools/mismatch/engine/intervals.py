@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -56,6 +57,23 @@ def before_rounding(problem: Problem, fitted: Fit) -> Fit:
         return fitted
     at = smooth.carry(model, fitted.theta, problem.recording)
     return replace(fitted, model=smooth, theta=at, residual=residuals(problem, smooth, at))
+
+
+def rounding_left(problem: Problem, fitted: Fit, output: str) -> float:
+    """Return the rms that a fitted quantiser leaves: the mean reading is predicted, not the side on which one falls.
+
+    B. Widrow, I. Kollar, Quantization Noise (2008), chapter 16: noise and rounding together, less the mean of steps.
+    """
+    model, theta = fitted.model, fitted.theta
+    placed = [k for k, p in enumerate(model.placed) if p.effect.name == "quantization" and output in p.outputs]
+    if not placed:
+        return 0.0
+    (step,), dither = model.placed[placed[0]].settings["step"], float(theta[model.slices(placed[0])[0]][0])
+    smooth = before_rounding(problem, fitted)
+    before = smooth.model.simulate(problem.view, smooth.theta, (output,))[output]
+    after = model.simulate(problem.view, theta, (output,))[output]
+    known = float(np.mean((after - before)[problem.held_rows] ** 2))
+    return math.sqrt(max(dither**2 + step**2 / 12.0 - known, 0.0))
 
 
 def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Array, which: Sequence[int]) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.evidence import Doubt
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.intervals import before_rounding
+from tools.mismatch.engine.intervals import rounding_left
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Withheld
@@ -310,23 +310,6 @@ def rest_of(problem: Problem, fitted: Fit, of_any_colour: Collection[str] = ()) 
         left[o] = replace(v, real=v.real or v.ratio * problem.sigma(o) ** 2 > LOUD * most**2)
         floors[o] = low, most
     return Rest(rest, left, floors)
-
-
-def rounding_left(problem: Problem, fitted: Fit, output: str) -> float:
-    """Return the rms that a fitted quantiser leaves: the mean reading is predicted, not the side on which one falls.
-
-    B. Widrow, I. Kollar, Quantization Noise (2008), chapter 16: noise and rounding together, less the mean of steps.
-    """
-    model, theta = fitted.model, fitted.theta
-    placed = [k for k, p in enumerate(model.placed) if p.effect.name == "quantization" and output in p.outputs]
-    if not placed:
-        return 0.0
-    (step,), dither = model.placed[placed[0]].settings["step"], float(theta[model.slices(placed[0])[0]][0])
-    smooth = before_rounding(problem, fitted)
-    before = smooth.model.simulate(problem.view, smooth.theta, (output,))[output]
-    after = model.simulate(problem.view, theta, (output,))[output]
-    known = float(np.mean((after - before)[problem.held_rows] ** 2))
-    return math.sqrt(max(dither**2 + step**2 / 12.0 - known, 0.0))
 
 
 def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple[float, float]:
