@@ -78,7 +78,7 @@ def test_losing_the_link_in_real_time_ends_safe_and_names_it(tmp_path: Path, blo
     timers[0].join()
     assert not safe["normal"]
     # all links of a killed world die at once; which one is asked first is chance
-    assert safe["reason"].startswith(("daq: ", "piezo: ") if blow == "kill" else "daq: ")
+    assert safe["reason"].startswith(("daq: ", "piezo: ", "telemetry: ") if blow == "kill" else "daq: ")
     if blow == "kill":
         # the amplifier died with its world: nobody can confirm neutral, and the report says so
         assert not safe["reached"]
