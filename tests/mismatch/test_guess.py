@@ -326,6 +326,15 @@ def test_dates_of_loggers_are_the_time(tmp_path: Path, head: str, cells: str):
     assert sum("time of day" in n for n in found.notes) == head.count(",")
 
 
+@pytest.mark.parametrize("broken", ["2026-03-10,18:1", "2026-03-10,", "2026-13-10,18:10:00"])
+def test_a_day_without_its_time_is_no_midnight(tmp_path: Path, broken: str):
+    rows = [f"2026-03-10,18:{k:02}:00,{np.sin(k)},{np.cos(k)}" for k in range(60)]
+    rows[10] = f"{broken},0.1,0.2"
+    (tmp_path / "a.csv").write_text("\n".join(["day,time,u_V,y_mm", *rows]))
+    with pytest.raises(RecordingError, match=r"line 12: column 'day': .* is no date like 2026-03-10 18:00:00"):
+        text_table(tmp_path / "a.csv").read(["day"])
+
+
 @pytest.mark.parametrize(("mark", "told"), [(-200.0, True), (-1.0, False), (3.0, False)])
 def test_a_number_that_marks_missing_values_is_told(tmp_path: Path, mark: float, told: bool):
     t = np.arange(400) / 10.0

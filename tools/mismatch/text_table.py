@@ -121,7 +121,8 @@ class TextTable:
         if cell.lower() in MISSING:
             return float("nan")
         try:
-            found = datetime.fromisoformat(cell)
+            # a day without its time would be read as midnight
+            found = datetime.fromisoformat(cell if _DATE.fullmatch(cell) else "")
         except ValueError:
             raise RecordingError(
                 f"{self.path}: line {number}: column '{self.names[column]}': '{cell[:40]}' is no date like {A_DATE};"

@@ -42,8 +42,6 @@ EFFECTS = (
 """Effects that every stretch of a record shows. What happens once would be in one recording of a family only."""
 GOALS = (0.9, 0)
 """Share of the families whose effect should be named, and of the null families that may name one."""
-EARLIER = """- Earlier draws of as many families, whose misses were looked at and led to changes of the engine: seed
-3011 named 16 of 20 and 0 of 100 nulls, seed 4177 named 13 of 17 and 1 of 100 nulls."""
 LEAST, MOST, USUAL = 5, 20, 400
 """Fewest and most recordings of a family, and the samples of each where the drawn case is neither short nor long."""
 
@@ -154,8 +152,11 @@ def not_run(rows: Sequence[dict[str, Any]], families: int, nulls: int) -> str:
     return ", ".join(f"{v} of a {twin.replace('_', ' ')}" for twin, v in left.items() if v > 0) or "none"
 
 
-def page(rows: Sequence[dict[str, Any]], samples: int, families: int, nulls: int) -> str:
-    """Return the result's page; ``families`` and ``nulls`` are the numbers that were asked for."""
+def page(rows: Sequence[dict[str, Any]], samples: int, families: int, nulls: int, remark: str = "") -> str:
+    """Return the result's page; ``families`` and ``nulls`` are the numbers that were asked for.
+
+    ``remark`` is what the rows do not know: earlier draws, and what was changed since.
+    """
     drawn, seed = [r for r in rows if r["drawn"]], rows[0]["seed"]
     revisions = "; ".join(dict.fromkeys(r["revision"] for r in rows))
     missed = [
@@ -180,7 +181,7 @@ recalibration.
 - {len(rows) - len(drawn)} of {len(rows)} families could not be drawn.
 - Not run of {families} families and {nulls} nulls, for lack of processor time: {not_run(rows, families, nulls)}.
 - CPU: {sum(r["cpu_s"] for r in drawn):.0f} s.
-{EARLIER}
+{"- " + remark if remark else ""}
 
 ## Not named
 
@@ -199,6 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no family after these")
     parser.add_argument("--alone", action="store_true", help="diagnose the first recording of each family alone, too")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the result there (.json or .md)")
+    parser.add_argument("--remark", default="", help="what the page says besides: earlier draws, later changes")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
     file = options.keep / "rows.jsonl"
@@ -219,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     print(table(rows))
     if options.out is not None:
-        write_result(options.out, page(rows, options.samples, options.families, options.nulls))
+        write_result(options.out, page(rows, options.samples, options.families, options.nulls, options.remark))
 
 
 if __name__ == "__main__":
